@@ -1,0 +1,62 @@
+"""What a run cost: the seconds of its named stages and the most memory that the process held."""
+
+from __future__ import annotations
+
+import resource
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+
+def peak_memory_mb() -> float:
+    """Most resident memory that this process has held so far, in MB (10⁶ bytes).
+
+    Linux's VmHWM where there is one: unlike ``ru_maxrss`` it does not start at the parent's size.
+    """
+    status = Path("/proc/self/status")
+    if status.exists():
+        line = next((line for line in status.read_text().splitlines() if line.startswith("VmHWM:")), None)
+        if line is not None:
+            return int(line.split()[1]) * 1024 / 1e6
+    unit_bytes = 1 if sys.platform == "darwin" else 1024
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit_bytes / 1e6
+
+
+class Stopwatch:
+    """Seconds of named stages, in the order in which they were first entered.
+
+    Attributes:
+        seconds: wall-clock seconds a stage; a stage entered again adds to its own.
+    """
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = {}
+        self._started = time.perf_counter()
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        """Time the block as ``name``, also when it raises."""
+        started = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - started
+
+    @property
+    def total(self) -> float:
+        """Seconds since the stopwatch was made, what no stage claimed included."""
+        return time.perf_counter() - self._started
+
+    def to_dict(self) -> dict:
+        """``{"stages": {name: s}, "seconds": s, "peak_memory_mb": MB}``."""
+        return {
+            "stages": {name: round(seconds, 3) for name, seconds in self.seconds.items()},
+            "seconds": round(self.total, 3),
+            "peak_memory_mb": round(peak_memory_mb(), 1),
+        }
+
+    def __str__(self) -> str:
+        stages = " · ".join(f"{name} {seconds:.1f} s" for name, seconds in self.seconds.items())
+        return f"{stages} · total {self.total:.1f} s, peak memory {peak_memory_mb() / 1000:.2f} GB"
