@@ -1,0 +1,99 @@
+"""Depth maps and poses become one surface: TSDF fusion, refinement, carve and patch, coverage."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Sequence as Indices
+
+import numpy as np
+
+from endotwin.errors import OptionError
+from endotwin.fusion.agreement import Tolerance, measured_noise
+from endotwin.fusion.coverage import covered
+from endotwin.fusion.mesh import surface_of, without_short_edges
+from endotwin.fusion.reconcile import reconciled
+from endotwin.fusion.refine import refined
+from endotwin.fusion.smooth import smoothed
+from endotwin.fusion.tsdf import footprint_voxel_mm, fuse_tsdf
+from endotwin.fusion.views import View, read_views
+from endotwin.sequence import Sequence
+from endotwin.surface import Surface
+
+__all__ = ["fuse"]
+
+SAMPLED_FRAMES = 12
+SHORTEST_EDGE_VOXELS = 0.25
+"""Marching cubes leaves slivers with edges shorter than this; their ends are made one."""
+COARSE_VOXELS = 2.5
+"""The noise is measured about a surface this many times coarser, whose truncation band it rarely leaves."""
+REACH_SIGMAS = 3.0
+
+Progress = Callable[[str, int, int], None]
+
+
+def fuse(
+    sequence: Sequence,
+    frames: Indices[int] | None = None,
+    photo_frames: Indices[int] | None = None,
+    voxel_mm: float | None = None,
+    progress: Progress | None = None,
+) -> Surface:
+    """The surface that agrees with the depth maps of ``frames``; the same input gives the same mesh.
+
+    TSDF fusion, vertices refined against the depth maps, two rounds of carve and patch, coverage. A few
+    frames are in memory at a time. A frame without any valid depth is skipped with a warning in the log
+    ``endotwin``.
+
+    Args:
+        frames: indices whose depth may be used; all unless given.
+        photo_frames: indices that count for the coverage; ``frames`` unless given.
+        voxel_mm: voxel edge of the TSDF; chosen from the pixel footprint and the noise unless given.
+        progress: called with (stage, done, total) as each frame of a stage begins.
+
+    Raises:
+        SequenceError: no frame has valid depth, or the depth gives no surface.
+        OptionError: a voxel size that is not positive, or no frames.
+    """
+    frames = list(range(len(sequence)) if frames is None else frames)
+    photo_frames = frames if photo_frames is None else list(photo_frames)
+    if not frames:
+        raise OptionError("No frames are left to fuse; choose at least one.")
+    if voxel_mm is not None and not voxel_mm > 0:
+        raise OptionError(f"The voxel size is {voxel_mm:g} mm, but must be greater than 0.")
+    camera, sample = sequence.camera, _spread(frames)
+
+    def views(stage: str, chosen: list[int] = frames, warn: bool = False) -> Iterator[View]:
+        return read_views(sequence, _reported(stage, chosen, progress), warn)
+
+    finest_mm, median_mm = footprint_voxel_mm(camera, views("voxel size", sample))
+    origin_mm = np.asarray(sequence.T_world_camera, np.float64)[frames, :3, 3].mean(axis=0)
+    coarse_mm = COARSE_VOXELS * max(finest_mm, voxel_mm or 0.0)
+    coarse = fuse_tsdf(camera, views("noise", sample), origin_mm, coarse_mm, noise_mm=0.0)
+    noise = measured_noise(camera, surface_of(origin_mm, *coarse), views("noise", sample))
+    voxel_mm = max(finest_mm, noise * median_mm) if voxel_mm is None else voxel_mm
+    tolerance = Tolerance.of(voxel_mm, noise)
+
+    vertices_mm, triangles = fuse_tsdf(
+        camera, views("fuse", warn=True), origin_mm, voxel_mm, noise * median_mm
+    )
+    vertices_mm, triangles = without_short_edges(vertices_mm, triangles, SHORTEST_EDGE_VOXELS * voxel_mm)
+    surface = surface_of(origin_mm, vertices_mm, triangles)
+    surface = refined(camera, surface, views("refine"), max(voxel_mm, REACH_SIGMAS * noise * median_mm))
+    for stage in ("carve and patch", "carve and patch again"):
+        surface = reconciled(camera, surface, views(stage), tolerance, voxel_mm)
+    surface = smoothed(surface)
+    return covered(camera, surface, views("coverage", photo_frames), sequence.lens_mask, tolerance)
+
+
+def _reported(stage: str, frames: list[int], progress: Progress | None) -> Iterable[int]:
+    """``frames``, with ``progress`` called as each is taken."""
+    for done, index in enumerate(frames, start=1):
+        if progress is not None:
+            progress(stage, done, len(frames))
+        yield index
+
+
+def _spread(frames: list[int]) -> list[int]:
+    """At most ``SAMPLED_FRAMES`` of ``frames``, evenly spread."""
+    chosen = np.unique(np.linspace(0, len(frames) - 1, min(len(frames), SAMPLED_FRAMES)).round().astype(int))
+    return [frames[index] for index in chosen]

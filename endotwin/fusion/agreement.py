@@ -1,0 +1,109 @@
+"""How a surface agrees with what each pixel measured."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from endotwin.cameras import Camera
+from endotwin.casting import Caster
+from endotwin.fusion.views import View, ahead
+from endotwin.surface import Surface
+
+
+@dataclass(frozen=True)
+class Tolerance:
+    """How far a hit may lie from the measured distance: max(``absolute_mm``, ``relative`` · distance)."""
+
+    absolute_mm: float
+    relative: float
+
+    @classmethod
+    def of(cls, voxel_mm: float, noise: float) -> Tolerance:
+        """What a surface can be held to: 1.5 voxels, 1% of the distance, or 4σ of relative ``noise``."""
+        return cls(1.5 * voxel_mm, max(0.01, 4 * noise))
+
+    def at(self, distance_mm: np.ndarray) -> np.ndarray:
+        """Tolerance in mm at distances of any shape."""
+        return np.maximum(np.float32(self.absolute_mm), np.float32(self.relative) * distance_mm)
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """One view against a surface, per pixel, row-major [H·W]; all false where nothing was measured.
+
+    Attributes:
+        view: the view compared.
+        residual_mm: float32, first hit minus measured distance; inf where nothing is hit, NaN where not
+            measured.
+        triangle: int32, first triangle hit, -1 where none.
+        allowed_mm: float32, the tolerance.
+        at: bool, hit where it was measured.
+        before: bool, hit in front of what was measured: a membrane.
+        lacking: bool, no hit, or one behind what was measured.
+    """
+
+    view: View
+    residual_mm: np.ndarray
+    triangle: np.ndarray
+    allowed_mm: np.ndarray
+    at: np.ndarray
+    before: np.ndarray
+    lacking: np.ndarray
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """Share of measured pixels that agree with a surface, miss it, see through it, or hit a membrane; sums
+    to 1."""
+
+    agrees: float
+    misses: float
+    sees_through: float
+    membrane: float
+
+
+def compare(
+    camera: Camera, surface: Surface, views: Iterable[View], tolerance: Tolerance
+) -> Iterator[Comparison]:
+    """Each of ``views`` against ``surface``, the next one being cast while this one is used."""
+    caster = Caster(surface)
+
+    def against(view: View) -> Comparison:
+        measured = view.distance_mm.reshape(-1)
+        hits = caster.cast(camera, view.T_world_camera, np.isfinite(view.distance_mm))
+        residual_mm = np.where(np.isfinite(measured), np.float32(np.inf), np.float32(np.nan))
+        residual_mm[hits.pixel] = hits.distance_mm - measured[hits.pixel]
+        triangle = np.full(len(measured), -1, np.int32)
+        triangle[hits.pixel] = hits.triangle
+        allowed_mm = tolerance.at(measured)
+        at = np.abs(residual_mm) <= allowed_mm
+        before, lacking = residual_mm < -allowed_mm, residual_mm > allowed_mm
+        return Comparison(view, residual_mm, triangle, allowed_mm, at, before, lacking)
+
+    yield from ahead(against, views)
+
+
+def measured_noise(camera: Camera, surface: Surface, views: Iterable[View]) -> float:
+    """Spread of the measured distances about ``surface``, relative to the distance.
+
+    It is 1.48 · the median absolute residual, so that folds which the surface lacks do not count.
+    """
+    spreads = []
+    for seen in compare(camera, surface, views, Tolerance(np.inf, 0.0)):
+        hit = seen.at
+        if hit.any():
+            measured_mm = seen.view.distance_mm.reshape(-1)[hit]
+            spreads.append(np.median(np.abs(seen.residual_mm[hit]) / measured_mm))
+    return 1.4826 * float(np.median(spreads)) if spreads else 0.0
+
+
+def agreement(camera: Camera, surface: Surface, views: Iterable[View], tolerance: Tolerance) -> Agreement:
+    """How well ``surface`` explains every measured pixel of ``views``."""
+    tally = np.zeros(4, np.int64)
+    for seen in compare(camera, surface, views, tolerance):
+        misses = seen.lacking & (seen.triangle < 0)
+        tally += [seen.at.sum(), misses.sum(), (seen.lacking & ~misses).sum(), seen.before.sum()]
+    return Agreement(*(tally / max(tally.sum(), 1)).tolist())

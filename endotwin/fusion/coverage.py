@@ -1,0 +1,70 @@
+"""What the photos saw of each vertex."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+
+from endotwin.cameras import Camera
+from endotwin.casting import Caster
+from endotwin.fusion.agreement import Tolerance
+from endotwin.fusion.refine import Sighting, sighting
+from endotwin.fusion.views import View, ahead
+from endotwin.surface import Surface
+
+CLEARANCE = 1e-3
+"""A ray reaches a vertex when its first hit is no nearer than this part of the distance."""
+
+
+def covered(
+    camera: Camera, surface: Surface, views: Iterable[View], lens_mask: np.ndarray, tolerance: Tolerance
+) -> Surface:
+    """``surface`` with ``seen_by``, ``best_cosine`` and ``nearest_mm`` over ``views``.
+
+    A view sees a vertex that faces it, projects onto a lit pixel (``lens_mask`` [H, W]) and is not hidden:
+    it is no farther than all pixels about it measured, up to the tolerance, or else than some of them, and
+    a ray reaches it. Vertices are asked, not triangles that pixels hit, so triangles may be larger or
+    smaller than pixels.
+    """
+    caster = Caster(surface)
+
+    def seen_in(view: View) -> Sighting:
+        seen = sighting(camera, surface, view.T_world_camera)
+        column, row = np.rint(seen.uv).astype(np.int32).T
+        nearest_mm, farthest_mm = _about(view.distance_mm, seen.uv)
+        clear = seen.distance_mm <= nearest_mm + tolerance.at(nearest_mm)
+        unsure = np.flatnonzero(~clear & (seen.distance_mm <= farthest_mm + tolerance.at(farthest_mm)))
+        clear[unsure] = _reached(caster, view.T_world_camera, seen[unsure])
+        return seen[np.flatnonzero(clear & lens_mask[row, column])]
+
+    count = len(surface.vertices_mm)
+    seen_by = np.zeros(count, np.int32)
+    best_cosine = np.zeros(count, np.float32)
+    nearest_mm = np.full(count, np.inf, np.float32)
+    for seen in ahead(seen_in, views, threads=2):
+        seen_by[seen.vertex] += 1
+        best_cosine[seen.vertex] = np.maximum(best_cosine[seen.vertex], seen.cosine)
+        nearest_mm[seen.vertex] = np.minimum(nearest_mm[seen.vertex], seen.distance_mm)
+    return surface.with_coverage(seen_by, best_cosine, nearest_mm)
+
+
+def _about(distance_mm: np.ndarray, uv: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Least and greatest distance [N] that the four pixels about ``uv`` [N, 2] measured; -inf where none
+    did."""
+    height, width = distance_mm.shape
+    column, row = np.minimum(uv.astype(np.int32), (width - 2, height - 2)).T
+    first = row * width + column
+    flat = distance_mm.reshape(-1)
+    near = [flat[first + step] for step in (0, 1, width, width + 1)]
+    nearest_mm = np.fmin(np.fmin(near[0], near[1]), np.fmin(near[2], near[3]))
+    farthest_mm = np.fmax(np.fmax(near[0], near[1]), np.fmax(near[2], near[3]))
+    return np.nan_to_num(nearest_mm, nan=-np.inf), np.nan_to_num(farthest_mm, nan=-np.inf)
+
+
+def _reached(caster: Caster, T_world_camera: np.ndarray, seen: Sighting) -> np.ndarray:
+    """Bool [N]: vertices of ``seen`` that the first hit of a ray towards them does not precede."""
+    centre = caster.surface.to_local(T_world_camera)[:3, 3].astype(np.float32)
+    directions = (caster.surface.vertices_mm[seen.vertex] - centre) / seen.distance_mm[:, None]
+    _, _, hit_mm = caster.cast_rays(np.broadcast_to(centre, directions.shape), directions)
+    return hit_mm >= seen.distance_mm * (1 - CLEARANCE)

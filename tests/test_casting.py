@@ -1,0 +1,116 @@
+"""Embree hits against Open3D's ray caster and against geometry."""
+
+import numpy as np
+import pytest
+import scenes
+
+from endotwin.casting import Caster
+from endotwin.fusion._open3d import o3c, o3d
+from endotwin.surface import Surface
+
+
+def sphere_surface(radius_mm: float = 15.0, centre_mm: float = 0.0) -> Surface:
+    """A sphere seen from inside: triangles and normals face its centre."""
+    mesh = o3d.geometry.TriangleMesh.create_sphere(radius_mm, 40)
+    vertices, triangles = np.asarray(mesh.vertices), np.asarray(mesh.triangles)[:, ::-1]
+    return Surface.from_mesh(vertices + centre_mm, triangles, -vertices / radius_mm)
+
+
+@pytest.fixture(scope="module")
+def surface():
+    return sphere_surface()
+
+
+def random_rays(count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(seed)
+    origins = rng.uniform(-8, 8, (count, 3)).astype(np.float32)
+    directions = rng.standard_normal((count, 3)).astype(np.float32)
+    return origins, directions / np.linalg.norm(directions, axis=1, keepdims=True)
+
+
+def test_hits_are_those_of_open3d(surface):
+    origins, directions = random_rays(100_000)
+    origins[::7] *= 4
+    scene = o3d.t.geometry.RaycastingScene()
+    scene.add_triangles(o3c.Tensor(surface.vertices_mm), o3c.Tensor(surface.triangles.astype(np.uint32)))
+    expected = scene.cast_rays(o3c.Tensor(np.concatenate([origins, directions], axis=1)))
+    triangle, barycentric, distance_mm = Caster(surface).cast_rays(origins, directions)
+    hit = np.isfinite(expected["t_hit"].numpy())
+    assert 0.5 < hit.mean() < 1
+    np.testing.assert_array_equal(triangle >= 0, hit)
+    np.testing.assert_allclose(distance_mm[hit], expected["t_hit"].numpy()[hit], rtol=1e-4, atol=1e-4)
+    same = hit & (triangle == expected["primitive_ids"].numpy().astype(np.int64))
+    assert same.sum() > 0.999 * hit.sum()
+    np.testing.assert_allclose(barycentric[same, 1:], expected["primitive_uvs"].numpy()[same], atol=2e-3)
+
+
+def test_barycentrics_give_back_the_hit_point(surface):
+    origins, directions = random_rays(20_000)
+    triangle, barycentric, distance_mm = Caster(surface).cast_rays(origins, directions)
+    points = np.einsum("nk,nka->na", barycentric, surface.vertices_mm[surface.triangles[triangle]])
+    np.testing.assert_allclose(points, origins + distance_mm[:, None] * directions, atol=1e-3)
+    np.testing.assert_allclose(barycentric.sum(axis=1), 1, atol=1e-6)
+    assert (barycentric >= 0).all()
+
+
+def test_no_ray_slips_through_shared_edges_and_vertices(surface):
+    rng = np.random.default_rng(1)
+    corners = surface.vertices_mm[surface.triangles]
+    chosen = rng.integers(0, len(corners), 1_000_000)
+    t = rng.uniform(0, 1, (len(chosen), 1)).round(1).astype(np.float32)
+    targets = (1 - t) * corners[chosen, 0] + t * corners[chosen, 1]
+    origins = np.broadcast_to(np.array([1.0, -2.0, 0.5], np.float32), targets.shape)
+    directions = targets - origins
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    triangle, _, _ = Caster(surface).cast_rays(origins, directions)
+    assert (triangle >= 0).all()
+
+
+def test_rays_that_are_not_finite_hit_nothing_and_leave_the_others_alone(surface):
+    origins, directions = random_rays(1000)
+    expected = Caster(surface).cast_rays(origins, directions)
+    directions[::3] = np.nan
+    origins[1::3] = np.inf
+    found = Caster(surface).cast_rays(origins, directions)
+    assert (found[0][::3] == -1).all() and (found[0][1::3] == -1).all()
+    assert np.isinf(found[2][::3]).all()
+    for array, reference in zip(found, expected, strict=True):
+        np.testing.assert_array_equal(array[2::3], reference[2::3])
+
+
+def test_no_rays_and_no_triangles_give_no_hits(surface):
+    none = np.zeros((0, 3), np.float32)
+    assert [len(array) for array in Caster(surface).cast_rays(none, none)] == [0, 0, 0]
+    empty = Surface.from_mesh(np.zeros((3, 3)), np.zeros((0, 3), int), np.zeros((3, 3)))
+    assert len(Caster(empty).cast(scenes.pinhole(), np.eye(4))) == 0
+
+
+@pytest.mark.parametrize("camera", [scenes.pinhole(), scenes.omni()], ids=["pinhole", "omni"])
+def test_cast_depth_is_that_of_the_scene(camera):
+    surface, scene, T = sphere_surface(), scenes.sphere(), scenes.look((3, 2, -4), (0.2, 0.1, 1))
+    hits = Caster(surface).cast(camera, T)
+    directions = camera.pixel_directions.reshape(-1, 3)
+    expected_mm = scene.distance_mm(T[:3, 3], directions[hits.pixel].astype(np.float64) @ T[:3, :3].T)
+    assert len(hits) == np.isfinite(directions).all(axis=1).sum()
+    np.testing.assert_allclose(hits.distance_mm, expected_mm, atol=0.05)
+    normals = hits.interpolate(surface, surface.normals)
+    assert (np.linalg.norm(normals, axis=1) > 0.99).all()
+
+
+def test_a_mask_lists_only_its_pixels(surface):
+    camera, T = scenes.pinhole(), scenes.look((1, 0, 0), (0, 0, 1))
+    mask = np.random.default_rng(2).random((camera.height, camera.width)) < 0.3
+    whole, part = Caster(surface).cast(camera, T), Caster(surface).cast(camera, T, mask)
+    np.testing.assert_array_equal(part.pixel, np.flatnonzero(mask))
+    np.testing.assert_array_equal(part.distance_mm, whole.distance_mm[np.flatnonzero(mask)])
+
+
+def test_hits_are_the_same_far_from_the_origin(surface):
+    camera, T = scenes.pinhole(), scenes.look((1, 0, 0), (0, 0, 1))
+    far = T.copy()
+    far[:3, 3] += 1e6
+    near_hits, far_hits = (
+        Caster(surface).cast(camera, T),
+        Caster(sphere_surface(centre_mm=1e6)).cast(camera, far),
+    )
+    np.testing.assert_allclose(far_hits.distance_mm, near_hits.distance_mm, atol=1e-4)
