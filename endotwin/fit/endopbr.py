@@ -1,0 +1,233 @@
+"""The method ``endopbr``: Han & Wu 2025 as published, to compare with.
+
+A hash grid and a small MLP are queried at each pixel's point; light, response and field are learned
+together by Adam from pixels of a few images a step, with normals from the gradient of the depth map. When
+done, the field is sampled at the vertices, so that the twin renders like any other.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from endotwin import shading
+from endotwin.fit.start import ALBEDO_TOP
+from endotwin.hashgrid import corner_slots
+from endotwin.incidence import COS_MIN, unit
+from endotwin.sequence import Frame
+from endotwin.stopwatch import Stopwatch
+from endotwin.twin import Light, Materials, Response, Twin
+
+LEVELS, FEATURES, LOG2_SLOTS = 16, 2, 19
+COARSEST_CELLS, FINEST_CELLS = 16, 2048
+"""Cells along the scene's longest side at the first and the last level (Müller et al. 2022, table 1)."""
+
+HIDDEN = 64
+IMAGES_A_STEP, PIXELS_A_STEP = 5, 30_000
+DEFAULT_EPOCHS = 100
+LEARNING_RATE = 1e-2
+METALLIC_WEIGHT, GRADIENT_WEIGHT = 1e-4, 1e-3
+BAKE_CHUNK = 1 << 16
+
+
+class Field(nn.Module):
+    """Base colour, roughness and metallic of points: hash grid and a 2×64 MLP.
+
+    Args:
+        low_mm, high_mm: float64 [3], the box of the scene.
+    """
+
+    def __init__(self, low_mm: np.ndarray, high_mm: np.ndarray):
+        super().__init__()
+        self.low_mm = low_mm
+        longest_mm = float((high_mm - low_mm).max())
+        growth = (FINEST_CELLS / COARSEST_CELLS) ** (1 / (LEVELS - 1))
+        self.cells_mm = longest_mm / COARSEST_CELLS / growth ** np.arange(LEVELS)
+        self.table = nn.Parameter(torch.empty(LEVELS << LOG2_SLOTS, FEATURES).uniform_(-1e-4, 1e-4))
+        self.decoder = nn.Sequential(
+            nn.Linear(LEVELS * FEATURES, HIDDEN),
+            nn.ReLU(),
+            nn.Linear(HIDDEN, HIDDEN),
+            nn.ReLU(),
+            nn.Linear(HIDDEN, 5),
+        )
+
+    def forward(self, points_mm: np.ndarray) -> tuple[Tensor, Tensor, Tensor]:
+        """Base colour [N, 3], roughness [N], metallic [N] at points float64 [N, 3], local frame."""
+        slots, weights = [], []
+        for level, cell_mm in enumerate(self.cells_mm):
+            slot, weight = corner_slots(points_mm - self.low_mm, cell_mm, LOG2_SLOTS)
+            slots.append(slot + (level << LOG2_SLOTS))
+            weights.append(weight)
+        slots, weights = (
+            np.stack(slots, 1).reshape(-1, 8),
+            np.stack(weights, 1).reshape(-1, 8).astype(np.float32),
+        )
+        features = nn.functional.embedding_bag(
+            torch.from_numpy(slots), self.table, per_sample_weights=torch.from_numpy(weights), mode="sum"
+        )
+        decoded = torch.sigmoid(self.decoder(features.reshape(len(points_mm), -1)))
+        return decoded[:, :3], decoded[:, 3], decoded[:, 4]
+
+
+class SharedParameters(nn.Module):
+    """L0, n, q and γ, kept positive by exponentials."""
+
+    def __init__(self, distance_mm: float):
+        super().__init__()
+        start = [2 * math.log(distance_mm), 0.0, math.log(2.0), math.log(1 / 2.2)]
+        self.logs = nn.Parameter(torch.tensor(start))
+
+    @property
+    def light(self) -> Light:
+        log_L0, log_n, log_q, _ = self.logs.tolist()
+        return Light(math.exp(log_L0), math.exp(log_n), math.exp(log_q))
+
+    @property
+    def response(self) -> Response:
+        return Response(math.exp(self.logs[3].item()))
+
+
+def photo_geometry(twin: Twin, frame: Frame, lens_mask: np.ndarray) -> dict[str, np.ndarray]:
+    """Points, incidence and colours of one photo's pixels, normals from the gradient of its depth map.
+
+    Returns:
+        points_mm [N, 3] in the surface's local frame; cos, sin2, log_cos_axis, log_distance [N]; color uint8
+        [N, 3].
+    """
+    rays = twin.camera.pixel_directions
+    points = rays * (frame.depth_mm / np.where(rays[..., 2] > COS_MIN, rays[..., 2], np.nan))[..., None]
+    across = np.gradient(points, axis=1)
+    down = np.gradient(points, axis=0)
+    normal = unit(np.cross(down, across))
+    to_eye = -rays
+    cos = np.einsum("hwk,hwk->hw", normal, to_eye)
+    use = lens_mask & np.isfinite(frame.depth_mm) & (np.abs(cos) > COS_MIN)
+    normal, cos, to_eye, points = normal[use], cos[use], to_eye[use], points[use].astype(np.float64)
+    normal, cos = normal * np.sign(cos)[:, None], np.abs(cos)
+    tangential = normal - cos[:, None] * to_eye
+    T_local_camera = twin.surface.to_local(frame.T_world_camera)
+    return {
+        "points_mm": points @ T_local_camera[:3, :3].T + T_local_camera[:3, 3],
+        "cos": cos,
+        "sin2": np.einsum("nk,nk->n", tangential, tangential),
+        "log_cos_axis": np.log(np.maximum(rays[..., 2][use], COS_MIN)),
+        "log_distance": np.log(np.linalg.norm(points, axis=1)).astype(np.float32),
+        "color": frame.color[use],
+    }
+
+
+def fit_endopbr(
+    twin: Twin,
+    budget_s: float | None,
+    epochs: int | None,
+    seed: int,
+    progress: Callable[[str, int, int], None] | None = None,
+) -> Twin:
+    """Train for ``epochs`` passes over the training images, or until ``budget_s`` seconds are up, whichever
+    is first.
+    """
+    stopwatch = Stopwatch()
+    torch.manual_seed(seed)
+    generator = np.random.default_rng(seed)
+    vertices = twin.surface.vertices_mm.astype(np.float64)
+    field = Field(vertices.min(axis=0) - 1, vertices.max(axis=0) + 1)
+    shared = SharedParameters(float(np.median(twin.surface.nearest_mm[twin.surface.seen_by > 0])))
+    optimizer = torch.optim.Adam([*field.parameters(), *shared.parameters()], lr=LEARNING_RATE, eps=1e-15)
+    sequence = twin.source.open()
+    frames = twin.source.training(len(sequence))
+    per_epoch = math.ceil(len(frames) / IMAGES_A_STEP)
+    steps = per_epoch * (epochs or (10**6 if budget_s else DEFAULT_EPOCHS))
+    started, done = time.perf_counter(), 0
+
+    def batch(chosen: np.ndarray) -> dict[str, np.ndarray]:
+        parts = [photo_geometry(twin, sequence.frame(frames[index]), sequence.lens_mask) for index in chosen]
+        joined = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+        picked = generator.integers(0, len(joined["cos"]), PIXELS_A_STEP)
+        return {name: values[picked] for name, values in joined.items()}
+
+    with stopwatch.stage("train"), ThreadPoolExecutor(1) as reader:
+        choose = _image_order(len(frames), generator)
+        ahead = reader.submit(batch, next(choose))
+        for done in range(1, steps + 1):
+            pixels, ahead = ahead.result(), reader.submit(batch, next(choose))
+            _step(field, shared, optimizer, pixels)
+            if progress:
+                progress("train", done, steps)
+            if budget_s is not None and time.perf_counter() - started >= budget_s:
+                break
+    with stopwatch.stage("bake"):
+        materials, light = _baked(field, shared, twin)
+    record = {"method": "endopbr", "steps": done, "epochs": done / per_epoch, **stopwatch.to_dict()}
+    return replace(twin, materials=materials, light=light, response=shared.response).with_record(fit=record)
+
+
+def _image_order(count: int, generator: np.random.Generator):
+    """IMAGES_A_STEP image indices at a time; every image once an epoch."""
+    while True:
+        order = generator.permutation(count)
+        for start in range(0, count, IMAGES_A_STEP):
+            yield order[start : start + IMAGES_A_STEP]
+
+
+def _step(field: Field, shared: SharedParameters, optimizer: torch.optim.Optimizer, pixels: dict) -> None:
+    optimizer.zero_grad(set_to_none=True)
+    base_color, roughness, metallic = field(pixels["points_mm"])
+    error = (
+        _predict(pixels, base_color, roughness, metallic, shared) - torch.from_numpy(pixels["color"]) / 255
+    ).abs()
+    few = slice(0, PIXELS_A_STEP // 8)
+    step_mm = field.cells_mm[-1]
+    beside = pixels["points_mm"][few] + step_mm * unit(
+        np.random.default_rng(0).normal(size=(PIXELS_A_STEP // 8, 3))
+    )
+    gradient = (field(beside)[0] - base_color[few]).abs().mean() / step_mm
+    loss = error.mean() + METALLIC_WEIGHT * metallic.abs().mean() + GRADIENT_WEIGHT * gradient
+    loss.backward()
+    optimizer.step()
+
+
+def _predict(
+    pixels: dict, base_color: Tensor, roughness: Tensor, metallic: Tensor, shared: SharedParameters
+) -> Tensor:
+    """C = (f·L·(n·ω)·2π)^γ (Han & Wu 2025), [N, 3]."""
+    cos, sin2, log_cos_axis, log_distance = (
+        torch.from_numpy(pixels[name]) for name in ("cos", "sin2", "log_cos_axis", "log_distance")
+    )
+    log_L0, log_n, log_q, log_gamma = shared.logs
+    strength = torch.exp(shading.log_spotlight(log_L0, log_n.exp(), log_q.exp(), log_cos_axis, log_distance))
+    shine = shading.F0_DIELECTRIC * shading.specular_colocated(cos, sin2, roughness)
+    reflected = shading.diffuse(base_color, metallic) + shine[:, None]
+    return shading.respond(reflected * (strength * cos * (2 * math.pi))[:, None], log_gamma.exp())
+
+
+def _baked(field: Field, shared: SharedParameters, twin: Twin) -> tuple[Materials, Light]:
+    """Materials at the vertices, with the scale that light and albedo share fixed as for the method
+    ``twin``.
+    """
+    parts = []
+    with torch.no_grad():
+        for start in range(0, len(twin.surface.vertices_mm), BAKE_CHUNK):
+            color, roughness, metallic = field(
+                twin.surface.vertices_mm[start : start + BAKE_CHUNK].astype(np.float64)
+            )
+            parts.append(torch.cat([color, roughness[:, None], metallic[:, None]], dim=1))
+    values = torch.cat(parts).numpy()
+    seen = twin.surface.seen_by > 0
+    scale = float(ALBEDO_TOP / np.percentile(values[seen if seen.any() else slice(None), :3].max(axis=1), 98))
+    light = shared.light
+    materials = Materials(
+        base_color=np.clip(values[:, :3] * scale, 0, 1),
+        roughness=np.ascontiguousarray(values[:, 3]),
+        metallic=np.ascontiguousarray(values[:, 4]),
+        f0=shading.F0_DIELECTRIC * scale,
+        diffuse="lambert",
+    )
+    return materials, Light(light.L0 / scale, light.n, light.q)

@@ -1,0 +1,265 @@
+"""Gauss–Newton over hash features, light and response, coarse to fine.
+
+Vertex parameters are a linear read-out of multiresolution hash features, θ = θ̄ + A·table. A Gaussian prior
+on the table whose width shrinks with the cell edge says that tissue varies more over millimetres than over
+tenths of one; it fills in what no photo shows. Each step solves (Aᵀ·JᵀWJ·A + P)·δ = Aᵀ·JᵀWe − P·table by
+preconditioned conjugate gradients, with the five shared parameters eliminated exactly (Schur complement),
+then searches along δ.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from endotwin.fit.model import Globals, at_pixels, predict
+from endotwin.fit.normal import CHANNELS, MeshPattern, NormalEquations, assemble, robust_cost
+from endotwin.fit.samples import Samples
+from endotwin.fit.start import PRIOR
+from endotwin.hashgrid import HashOperator
+from endotwin.shading import F0_DIELECTRIC
+
+NOISE_MIN = 1 / 255
+"""Least noise assumed, in display values: 8-bit rounding and a step of sensor noise."""
+
+TEMPER = 4.0
+"""Model errors of neighbouring pixels agree: so many pixels count as one independent observation."""
+
+HUBER = 1.0
+"""Residuals beyond so many noise widths count linearly: rims, highlights, what the model does not know."""
+
+ROUGHNESS_RANGE = (0.08, 1.0)
+COLOR_SPREAD = 0.5
+ROUGHNESS_SPREAD = 0.1
+"""Standard deviation of a table entry of a COARSE_MM cell: base colour, roughness."""
+
+ROUGHNESS_MEAN = 0.4
+COARSE_MM = 12.0
+
+GLOBAL_MEAN = (
+    0.0,
+    PRIOR["gamma"] * PRIOR["n"],
+    PRIOR["gamma"] * PRIOR["q"],
+    PRIOR["gamma"],
+    math.log(F0_DIELECTRIC),
+)
+GLOBAL_SPREAD = (5.0, 0.5, 0.25, 0.1, 0.5)
+GLOBAL_RANGE = ((-20.0, 20.0), (0.0, 10.0), (0.0, 4.0), (0.15, 1.5), (-6.0, -0.7))
+"""Prior and bounds of the shared parameters, in the order of GLOBALS."""
+
+COLOR_RANGE = (1e-3, 2.0)
+
+CG_TOLERANCE = 1e-3
+CG_STEPS = 25
+SEARCH_SAMPLES = 300_000
+
+
+@dataclass(frozen=True)
+class State:
+    """What is fitted: table [R, 4] of one operator, its mean [4], and the shared parameters."""
+
+    operator: HashOperator
+    mean: Tensor
+    table: Tensor
+    shared: Globals
+
+    @property
+    def raw(self) -> Tensor:
+        """θ = θ̄ + A·table, [V, 4]."""
+        return self.mean + self.operator(self.table)
+
+    @property
+    def materials(self) -> Tensor:
+        """Base colour and roughness of every vertex, [V, 4]."""
+        raw = self.raw
+        low, high = ROUGHNESS_RANGE
+        return torch.cat(
+            [self._shown(raw) ** (1 / self.shared.gamma), low + (high - low) * torch.sigmoid(raw[:, 3:])],
+            dim=1,
+        )
+
+    @property
+    def link_slope(self) -> Tensor:
+        """d materials / dθ, [V, 4]. Base colour keeps its slope at the clamp, so that it can come back."""
+        raw, gamma = self.raw, self.shared.gamma
+        low, high = ROUGHNESS_RANGE
+        s = torch.sigmoid(raw[:, 3:])
+        return torch.cat([self._shown(raw) ** (1 / gamma - 1) / gamma, (high - low) * s * (1 - s)], dim=1)
+
+    def _shown(self, raw: Tensor) -> Tensor:
+        """Base colour as displayed, b^γ [V, 3]: the form in which it is fitted, since there the photo is
+        linear in it.
+        """
+        low, high = (bound**self.shared.gamma for bound in COLOR_RANGE)
+        return raw[:, :3].clamp(low, high)
+
+
+def roughness_to_raw(roughness: float) -> float:
+    low, high = ROUGHNESS_RANGE
+    share = (roughness - low) / (high - low)
+    return float(np.log(share / (1 - share)))
+
+
+def prior_precision(operator: HashOperator) -> Tensor:
+    """Inverse prior variance of each table entry, float32 [R, 4]."""
+    cell = torch.from_numpy(operator.cells_mm[operator.level] / COARSE_MM).float()
+    low, high = ROUGHNESS_RANGE
+    link = (high - low) / 4
+    color = 1 / (COLOR_SPREAD**2 * cell)
+    roughness = 1 / ((ROUGHNESS_SPREAD / link) ** 2 * cell**2)
+    return torch.stack([color, color, color, roughness], dim=1)
+
+
+class GaussNewton:
+    """Steps on one set of samples with one operator."""
+
+    def __init__(self, samples: Samples, triangles: np.ndarray, operator: HashOperator, seed: int = 0):
+        vertex_count = operator.forward_csr.shape[0]
+        self.samples = samples
+        self.triangles = torch.from_numpy(triangles.astype(np.int64))
+        self.pattern = MeshPattern(samples, triangles, vertex_count)
+        self.operator = operator
+        self.precision = prior_precision(operator)
+        self.trial = samples.thinned(SEARCH_SAMPLES, np.random.default_rng(seed))
+        self.squared_adjoint = _squared(operator.adjoint_csr)
+
+    def noise(self, state: State) -> float:
+        """Robust standard deviation of the residual, in display values."""
+        error = self.trial.color.float() / 255 - self._predict(state)
+        return max(1.4826 * float(error.abs().median()), NOISE_MIN)
+
+    def cost(self, state: State, noise: float) -> float:
+        """Negative log posterior, on the trial samples scaled up to all of them."""
+        share = len(self.samples) / max(1, len(self.trial))
+        data = robust_cost(self.trial, self._predict(state), HUBER * noise) * share / (noise**2 * TEMPER)
+        prior = float((self.precision * state.table**2).double().sum()) / 2
+        mean, spread = _global_prior()
+        return data + prior + float((((state.shared.vector - mean) / spread) ** 2).sum()) / 2
+
+    def step(self, state: State, joint: bool = True) -> tuple[State, float]:
+        """One Gauss–Newton step with a backtracking line search; the state and by how much its cost fell (0:
+        no step).
+
+        Light, response and f0 move only in a ``joint`` step, which costs six times as much.
+        """
+        noise = self.noise(state)
+        scale = 1 / (noise**2 * TEMPER)
+        equations = assemble(
+            self.samples, self.pattern, self.triangles, state.materials, state.shared, HUBER * noise
+        )
+        table_step, shared_step = self._solve(state, equations, scale, joint)
+        before = self.cost(state, noise)
+        for length in (1.0, 0.5, 0.25, 0.1):
+            moved = replace(
+                state,
+                table=state.table + length * table_step,
+                shared=_bounded(state.shared.vector + length * shared_step),
+            )
+            after = self.cost(moved, noise)
+            if after < before:
+                return moved, before - after
+        return state, 0.0
+
+    def _predict(self, state: State) -> Tensor:
+        return predict(self.trial, at_pixels(self.trial, self.triangles, state.materials), state.shared)
+
+    def _solve(
+        self, state: State, equations: NormalEquations, scale: float, joint: bool
+    ) -> tuple[Tensor, Tensor]:
+        link = state.link_slope[..., None]
+        mean, spread = _global_prior()
+
+        def product(x: Tensor) -> Tensor:
+            rows, _, columns = x.shape
+            vertex = (self.operator.forward_csr @ x.reshape(rows, -1)).reshape(-1, CHANNELS, columns)
+            vertex = link * (equations @ (link * vertex)) * scale
+            back = self.operator.adjoint_csr @ vertex.reshape(len(vertex), -1)
+            return back.reshape(rows, CHANNELS, columns) + self.precision[..., None] * x
+
+        right = (equations.right[..., : None if joint else 1] * link * scale).reshape(len(link), -1)
+        right = (self.operator.adjoint_csr @ right).reshape(len(state.table), CHANNELS, -1)
+        right[..., 0] -= self.precision * state.table
+        block = equations.lumped() * (link * link.transpose(1, 2)) * scale
+        block = (self.squared_adjoint @ block.reshape(len(link), -1)).reshape(-1, CHANNELS, CHANNELS)
+        inverse = torch.linalg.inv(block + torch.diag_embed(self.precision))
+        solved = conjugate_gradients(product, right, inverse)
+
+        if not joint:
+            return solved[..., 0], torch.zeros_like(spread)
+        pull = ((mean - state.shared.vector) / spread**2).numpy()
+        shared_normal = equations.shared * scale + np.diag(1 / spread.numpy() ** 2)
+        weights, shared_step = _joint_minimum(
+            solved, product(solved), right, shared_normal, equations.shared_right * scale + pull
+        )
+        return solved @ torch.from_numpy(weights).float(), torch.from_numpy(shared_step)
+
+
+def _joint_minimum(
+    basis: Tensor, image: Tensor, right: Tensor, shared_normal: np.ndarray, shared_right: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Minimise the bordered quadratic over the shared parameters and the span of ``basis``.
+
+    With exact solutions as basis this is elimination by Schur complement; with truncated ones it still
+    descends.
+
+    Args:
+        basis, image, right: [R, C, 1 + G]: solutions, their products with the matrix, right-hand sides, of
+            which the
+            first is the residual's and the others border the matrix.
+
+    Returns:
+        weights of the basis [1 + G]; shared step [G].
+    """
+    columns = basis.shape[2]
+    flat = [x.reshape(-1, columns).double().numpy() for x in (basis, image, right)]
+    inner, border = flat[0].T @ flat[1], flat[0].T @ flat[2]
+    matrix = np.block([[inner, border[:, 1:]], [border[:, 1:].T, shared_normal]])
+    solution = np.linalg.lstsq(matrix, np.r_[border[:, 0], shared_right], rcond=1e-12)[0]
+    return solution[:columns], solution[columns:]
+
+
+def conjugate_gradients(product: Callable[[Tensor], Tensor], right: Tensor, inverse: Tensor) -> Tensor:
+    """Solve for all right-hand sides [R, C, K] at once, preconditioned by blocks ``inverse`` [R, C, C]."""
+    x = torch.zeros_like(right)
+    residual = right.clone()
+    z = inverse @ residual
+    direction = z.clone()
+    energy = (residual * z).sum(dim=(0, 1))
+    goal = CG_TOLERANCE**2 * energy
+    for _ in range(CG_STEPS):
+        image = product(direction)
+        length = energy / (direction * image).sum(dim=(0, 1)).clamp_min(1e-30)
+        x += length * direction
+        residual -= length * image
+        z = inverse @ residual
+        renewed = (residual * z).sum(dim=(0, 1))
+        if (renewed <= goal).all():
+            break
+        direction = z + (renewed / energy.clamp_min(1e-30)) * direction
+        energy = renewed
+    return x
+
+
+def _global_prior() -> tuple[Tensor, Tensor]:
+    return torch.tensor(GLOBAL_MEAN, dtype=torch.float64), torch.tensor(GLOBAL_SPREAD, dtype=torch.float64)
+
+
+def _bounded(vector: Tensor) -> Globals:
+    limits = torch.tensor(GLOBAL_RANGE, dtype=torch.float64)
+    return Globals(torch.clamp(vector, limits[:, 0], limits[:, 1]))
+
+
+def _squared(matrix: Tensor) -> Tensor:
+    """The CSR matrix with each entry squared."""
+    return torch.sparse_csr_tensor(
+        matrix.crow_indices(),
+        matrix.col_indices(),
+        matrix.values() ** 2,
+        matrix.shape,
+        check_invariants=False,
+    )

@@ -1,0 +1,177 @@
+"""Normal equations of one Gauss–Newton step over vertex materials and shared parameters.
+
+Each pixel touches the three vertices of its triangle, so the normal matrix of a material channel has the
+sparsity of the mesh. Base colours of different channels do not meet; roughness meets all three. Shared
+parameters (GLOBALS) border it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.sparse
+import torch
+from torch import Tensor
+
+from endotwin.fit.model import GLOBALS, Globals, at_pixels, linearise
+from endotwin.fit.samples import Samples
+from endotwin.hashgrid import to_torch
+
+CHANNELS = 4
+"""Base colour red, green, blue; roughness."""
+
+CORNER_PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
+CHUNK = 1 << 18
+CLIPPED = 255
+
+
+@dataclass(frozen=True)
+class Residual:
+    """Photo minus prediction at N samples [N, 3] and its robust weight [N, 3].
+
+    A clipped photo says "at least": where the prediction is brighter, residual and weight are 0.
+    """
+
+    error: Tensor
+    weight: Tensor
+
+    @classmethod
+    def of(cls, samples: Samples, predicted: Tensor, width: float) -> Residual:
+        """Pseudo-Huber residual: quadratic below ``width`` (display values), linear well above."""
+        error = samples.color.to(predicted.dtype) / 255 - predicted
+        satisfied = (samples.color >= CLIPPED) & (error < 0)
+        error = torch.where(satisfied, 0, error)
+        weight = torch.rsqrt(1 + (error / width) ** 2)
+        return cls(error, torch.where(satisfied, 0, weight))
+
+
+def robust_cost(samples: Samples, predicted: Tensor, width: float) -> float:
+    """Sum of the pseudo-Huber losses width²·(√(1 + (e/width)²) − 1) that ``Residual`` weighs."""
+    error = Residual.of(samples, predicted, width).error.double()
+    return float((width**2 * (torch.sqrt(1 + (error / width) ** 2) - 1)).sum())
+
+
+class MeshPattern:
+    """Where the products of a sample set land in a vertex × vertex matrix."""
+
+    def __init__(self, samples: Samples, triangles: np.ndarray, vertex_count: int):
+        self.vertex_count = vertex_count
+        hit, self.compact = np.unique(samples.triangle.numpy(), return_inverse=True)
+        self.corners = triangles[hit]
+        rows = np.concatenate([self.corners[:, [i, j]].T.ravel() for i, j in CORNER_PAIRS])
+        columns = np.concatenate([self.corners[:, [j, i]].T.ravel() for i, j in CORNER_PAIRS])
+        key = rows.astype(np.int64) * vertex_count + columns
+        # A diagonal pair fills both of its slots with the same entry: the second is dropped by a weight of 0.
+        self._order = np.argsort(key, kind="stable")
+        key = key[self._order]
+        first = np.flatnonzero(np.r_[True, key[1:] != key[:-1]])
+        self._segments, self._indices = first, (key[first] % vertex_count)
+        self._pointers = np.searchsorted(key[first] // vertex_count, np.arange(vertex_count + 1))
+
+    def matrix(self, pair_sums: np.ndarray) -> Tensor:
+        """Symmetric CSR [V, V] from sums [T, 6] of weighted products of barycentrics, by CORNER_PAIRS."""
+        values = np.concatenate(
+            [
+                np.concatenate([pair_sums[:, k], pair_sums[:, k] * (i != j)])
+                for k, (i, j) in enumerate(CORNER_PAIRS)
+            ]
+        )
+        data = np.add.reduceat(values[self._order], self._segments) if len(values) else values
+        shape = (self.vertex_count, self.vertex_count)
+        return to_torch(scipy.sparse.csr_matrix((data, self._indices, self._pointers), shape))
+
+    def vector(self, corner_sums: np.ndarray) -> np.ndarray:
+        """Vertex sums [V, C] from triangle corner sums [T, 3, C]."""
+        flat = corner_sums.reshape(-1, corner_sums.shape[2])
+        ids = self.corners.reshape(-1)
+        return np.stack([np.bincount(ids, column, self.vertex_count) for column in flat.T], axis=1)
+
+
+@dataclass(frozen=True)
+class NormalEquations:
+    """JᵀWJ and JᵀWe of one linearisation.
+
+    Attributes:
+        color: three CSR [V, V], base colour by base colour. mixed: three CSR, base colour by roughness.
+        roughness: CSR [V, V].
+        right: float32 [V, 4, 1 + 5], JᵀW(e | dC/dGLOBALS) by channel.
+        shared: float64 [5, 5] and shared_right [5], those of GLOBALS.
+    """
+
+    color: list[Tensor]
+    mixed: list[Tensor]
+    roughness: Tensor
+    right: Tensor
+    shared: np.ndarray
+    shared_right: np.ndarray
+
+    def __matmul__(self, values: Tensor) -> Tensor:
+        """Product with vertex values [V, 4, K]."""
+        v = [values[:, channel].contiguous() for channel in range(CHANNELS)]
+        rows = [self.color[c] @ v[c] + self.mixed[c] @ v[3] for c in range(3)]
+        rows.append(self.roughness @ v[3] + sum(self.mixed[c] @ v[c] for c in range(3)))
+        return torch.stack(rows, dim=1)
+
+    def lumped(self) -> Tensor:
+        """Row sums as one symmetric 4×4 block a vertex, [V, 4, 4]."""
+        ones = torch.ones(self.right.shape[0], 1)
+        block = torch.zeros(self.right.shape[0], CHANNELS, CHANNELS)
+        for c in range(3):
+            block[:, c, c] = (self.color[c] @ ones)[:, 0]
+            block[:, c, 3] = block[:, 3, c] = (self.mixed[c] @ ones)[:, 0]
+        block[:, 3, 3] = (self.roughness @ ones)[:, 0]
+        return block
+
+
+def assemble(
+    samples: Samples,
+    pattern: MeshPattern,
+    triangles: Tensor,
+    materials: Tensor,
+    shared: Globals,
+    width: float,
+) -> NormalEquations:
+    """Linearise at vertex ``materials`` [V, 4] and ``shared``, and sum over the samples."""
+    count = len(pattern.corners)
+    pair_sums = np.zeros((7, count, len(CORNER_PAIRS)), np.float32)
+    corner_sums = np.zeros((count, 3, CHANNELS * (1 + len(GLOBALS))), np.float32)
+    normal, right = np.zeros((len(GLOBALS),) * 2), np.zeros(len(GLOBALS))
+    for start, part in zip(range(0, len(samples), CHUNK), samples.chunks(CHUNK), strict=True):
+        model = linearise(part, at_pixels(part, triangles, materials), shared)
+        residual = Residual.of(part, model.predicted, width)
+        ids = pattern.compact[start : start + len(part)]
+        starts = np.flatnonzero(np.r_[True, ids[1:] != ids[:-1]])
+        pairs = torch.stack([part.barycentric[:, i] * part.barycentric[:, j] for i, j in CORNER_PAIRS], dim=1)
+        weighted_color = residual.weight * model.by_color
+        weighted_roughness = residual.weight * model.by_roughness
+        products = [weighted_color[:, c] * model.by_color[:, c] for c in range(3)]
+        products += [weighted_color[:, c] * model.by_roughness[:, c] for c in range(3)]
+        products.append((weighted_roughness * model.by_roughness).sum(dim=1))
+        for k, product in enumerate(products):
+            pair_sums[k][ids[starts]] += np.add.reduceat((pairs * product[:, None]).numpy(), starts, axis=0)
+        against = torch.cat([residual.error[..., None], model.by_globals], dim=2)
+        channels = torch.cat(
+            [
+                weighted_color[..., None] * against,
+                (weighted_roughness[..., None] * against).sum(dim=1, keepdim=True),
+            ],
+            dim=1,
+        ).flatten(1)
+        for corner in range(3):
+            terms = (channels * part.barycentric[:, corner, None]).numpy()
+            corner_sums[:, corner][ids[starts]] += np.add.reduceat(terms, starts, axis=0)
+        slopes = model.by_globals.flatten(0, 1)
+        weighted = (slopes * residual.weight.reshape(-1, 1)).T
+        normal += (weighted @ slopes).double().numpy()
+        right += (weighted @ residual.error.reshape(-1)).double().numpy()
+    vertex = pattern.vector(corner_sums).astype(np.float32)
+    matrices = [pattern.matrix(sums) for sums in pair_sums]
+    return NormalEquations(
+        color=matrices[:3],
+        mixed=matrices[3:6],
+        roughness=matrices[6],
+        right=torch.from_numpy(vertex).reshape(-1, CHANNELS, 1 + len(GLOBALS)),
+        shared=normal,
+        shared_right=right,
+    )

@@ -1,0 +1,218 @@
+"""The fit recovers the light, the response and the materials that the photos were rendered with."""
+
+import json
+import logging
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+import tube_sequence
+
+import endotwin
+from endotwin.casting import Caster
+from endotwin.evaluation import covered_pixels
+from endotwin.fit import FitOptions, fit
+from endotwin.fit.samples import gather
+from endotwin.fit.solve import median_edge_mm, proxies
+
+
+@pytest.fixture(scope="module", autouse=True)
+def one_thread():
+    """Small products finish sooner on one thread than on two that share their cores with other processes."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
+
+
+@pytest.fixture(scope="module")
+def tube(tmp_path_factory) -> endotwin.Twin:
+    """The unfitted twin of a small painted cylinder."""
+    return endotwin.fuse_twin(tube_sequence.write(tmp_path_factory.mktemp("fit") / "tube", frames=10))
+
+
+@pytest.fixture(scope="module")
+def colon(example) -> endotwin.Twin:
+    """The bundled example at half its size, fitted."""
+    return endotwin.fit_twin(endotwin.fuse_twin(example, scale=0.5))
+
+
+def made(sequence: Path) -> dict:
+    return json.loads((sequence / "truth" / "made.json").read_text())
+
+
+def albedo_rmse(twin: endotwin.Twin, sequence: Path) -> float:
+    """RMSE of the base colour over the covered pixels of the frames with truth, after one global scale."""
+    opened, caster, got, truth = endotwin.open_sequence(sequence), Caster(twin.surface), [], []
+    for file in sorted((sequence / "truth").glob("*_albedo.png")):
+        index = int(file.name[:4])
+        hits = caster.cast(
+            opened.camera,
+            opened.T_world_camera[index],
+            np.isfinite(opened.depth_mm(index)) & opened.lens_mask,
+        )
+        shape = (opened.camera.height, opened.camera.width)
+        covered = covered_pixels(hits, twin.surface, shape).reshape(-1)[hits.pixel]
+        got.append(hits.interpolate(twin.surface, twin.materials.base_color)[covered])
+        truth.append(cv2.imread(str(file))[..., ::-1].reshape(-1, 3)[hits.pixel][covered] / 255)
+    got, truth = np.concatenate(got), np.concatenate(truth)
+    assert len(truth) > 100_000
+    scale = (got * truth).sum() / (got * got).sum()
+    return float(np.sqrt(((scale * got - truth) ** 2).mean()))
+
+
+def same_materials(one: endotwin.Twin, other: endotwin.Twin) -> bool:
+    return all(
+        np.array_equal(value, other.materials.per_vertex[name])
+        for name, value in one.materials.per_vertex.items()
+    )
+
+
+def test_light_and_response_of_the_example_are_recovered(colon, example):
+    truth = made(example)
+    assert colon.response.gamma == pytest.approx(truth["gamma"], rel=0.03)
+    assert colon.light.n == pytest.approx(truth["light"]["n"], rel=0.05)
+    assert colon.light.q == pytest.approx(truth["light"]["q"], rel=0.04)
+
+
+def test_base_color_of_the_example_is_the_painted_albedo_up_to_one_scale(colon, example):
+    assert albedo_rmse(colon, example) < 0.05
+
+
+def test_the_example_predicts_photos_that_it_never_saw(colon):
+    assert endotwin.evaluate(colon).psnr_covered > 33
+
+
+def test_materials_are_physical_and_the_brightest_albedo_has_the_agreed_scale(colon):
+    materials = colon.materials
+    assert materials.base_color.min() >= 0 and materials.base_color.max() <= 1
+    assert materials.roughness.min() >= 0 and materials.roughness.max() <= 1
+    assert not materials.metallic.any() and 0 < materials.f0 < 0.5
+    assert np.percentile(materials.base_color[colon.surface.seen_by > 0].max(axis=1), 98) == pytest.approx(
+        0.8, rel=1e-3
+    )
+    assert all(value.dtype == np.float32 for value in materials.per_vertex.values())
+
+
+def test_the_record_tells_the_method_and_the_seconds_of_each_stage(colon):
+    record = colon.record["fit"]
+    assert record["method"] == "twin" and record["undetermined"] == []
+    assert set(record["stages"]) >= {"gather", "start", "light", "detail"}
+    assert sum(record["stages"].values()) == pytest.approx(record["seconds"], rel=0.1, abs=0.1)
+
+
+def test_light_and_response_of_a_lambertian_tube_are_recovered(tube):
+    """Eight photos of 96 × 72 pixels, of a cylinder whose closed end meets its wall in an edge."""
+    twin = endotwin.fit_twin(tube)
+    assert twin.response.gamma == pytest.approx(tube_sequence.GAMMA, rel=0.08)
+    assert twin.light.n == pytest.approx(tube_sequence.CONE, rel=0.08)
+    assert twin.light.q == pytest.approx(tube_sequence.FALLOFF, rel=0.08)
+    assert endotwin.evaluate(twin).psnr_covered > 36
+
+
+def test_the_same_seed_gives_the_same_twin_to_the_bit(tube):
+    one, other = (endotwin.fit_twin(tube, seed=3) for _ in range(2))
+    assert same_materials(one, other)
+    assert (one.light, one.response) == (other.light, other.response)
+
+
+def test_pixels_beyond_the_number_asked_for_are_drawn_by_the_seed(tube):
+    every = gather(tube, 10**9, 0)
+    some, again, others = (gather(tube, 10_000, seed) for seed in (0, 0, 1))
+    assert len(some) == pytest.approx(10_000 * len(every) / (8 * 96 * 72), rel=0.1)
+    assert torch.equal(some.triangle, again.triangle) and torch.equal(some.cos, again.cos)
+    assert len(some) != len(others) or not torch.equal(some.cos, others.cos)
+    assert (every.triangle.diff() >= 0).all()
+
+
+def test_samples_carry_the_color_that_their_surface_point_has_under_their_incidence(tube):
+    """The tube's own closed form, from each sample's point, cosine, axis angle and distance."""
+    samples = gather(tube, 10**9, 0)
+    assert 0.7 < len(samples) / (8 * 96 * 72) <= 1
+    corners = tube.surface.vertices_mm[tube.surface.triangles[samples.triangle.numpy()]]
+    local = np.einsum("nk,nkc->nc", samples.barycentric.numpy(), corners)
+    x, y, z = (local + tube.surface.origin_mm).T
+    wave = 0.5 + 0.25 * np.sin(3 * np.arctan2(y, x) + 0.4 * z) + 0.2 * np.cos(0.9 * z)
+    light = 40 * np.exp(2 * samples.log_cos_axis.numpy() - 2 * samples.log_distance.numpy())
+    radiance = wave[:, None] * [0.8, 0.45, 0.35] * (light * samples.cos.numpy() * 2)[:, None]
+    error = np.abs(samples.color.numpy() / 255 - np.clip(radiance, 0, 1) ** tube_sequence.GAMMA)
+    assert np.median(error) < 1 / 255
+    assert np.percentile(error, 95) < 4 / 255
+
+
+@pytest.mark.parametrize("budget_s", (1e-3, 0.3))
+def test_a_budget_too_small_still_gives_a_finite_twin_in_about_the_least_time(tube, budget_s):
+    twin = endotwin.fit_twin(tube, budget_s=budget_s)
+    for value in twin.materials.per_vertex.values():
+        assert np.isfinite(value).all() and value.min() >= 0 and value.max() <= 1
+    assert np.isfinite([twin.light.L0, twin.light.n, twin.light.q, twin.response.gamma]).all()
+    assert endotwin.evaluate(twin).psnr > 20
+
+
+def test_black_photos_give_a_finite_twin_and_a_warning(tmp_path, caplog):
+    folder = tube_sequence.write(tmp_path / "tube", frames=4)
+    black = np.full((72, 96, 3), 4, np.uint8)
+    for file in folder.glob("*_color.png"):
+        cv2.imwrite(str(file), black)
+    with caplog.at_level(logging.WARNING, "endotwin"):
+        twin = endotwin.fit_twin(endotwin.fuse_twin(folder))
+    assert "cannot tell" in caplog.text
+    assert all(np.isfinite(value).all() for value in twin.materials.per_vertex.values())
+    assert np.isfinite([twin.light.L0, twin.light.n, twin.light.q, twin.response.gamma]).all()
+
+
+def test_photos_that_show_nothing_of_the_surface_are_an_error(tube, tmp_path):
+    """Poses moved by a metre: no ray meets the surface."""
+    folder = tube_sequence.write(tmp_path / "tube", frames=3)
+    T_world_camera = tube_sequence.poses(3)
+    T_world_camera[:, 0, 3] += 1000
+    tube_sequence.write_poses(folder / "pose.txt", T_world_camera)
+    moved = endotwin.Twin(tube.surface, tube.camera, type(tube.source)(str(folder), "c3vd"))
+    with pytest.raises(endotwin.EndotwinError, match="show nothing of the surface"):
+        endotwin.fit_twin(moved)
+
+
+@pytest.mark.parametrize(
+    "options, message",
+    [
+        (FitOptions(method="nerf"), "unknown method 'nerf'.*twin, endopbr"),
+        (FitOptions(method="twin", epochs=3), "--epochs belongs to --method endopbr"),
+    ],
+)
+def test_options_that_make_no_sense_are_refused(tube, options, message):
+    with pytest.raises(endotwin.EndotwinError, match=message):
+        fit(tube, options)
+
+
+def test_proxies_are_the_means_of_the_vertices_of_a_cell(tube):
+    vertices_mm, cell_mm = tube.surface.vertices_mm, 1.5
+    points, group = proxies(vertices_mm, cell_mm)
+    assert len(points) == group.max() + 1 < len(vertices_mm)
+    for number in (0, len(points) // 2, len(points) - 1):
+        members = vertices_mm[group == number]
+        assert len(np.unique(np.floor(members / cell_mm), axis=0)) == 1
+        np.testing.assert_allclose(points[number], members.mean(axis=0), atol=1e-4)
+    assert 0 < median_edge_mm(tube.surface) < 2
+
+
+@pytest.fixture(scope="module")
+def colon_direct(data_root) -> endotwin.Twin:
+    threads = torch.get_num_threads()
+    torch.set_num_threads(2)
+    twin = endotwin.fit_twin(endotwin.fuse_twin(data_root / "colon_direct"))
+    torch.set_num_threads(threads)
+    return twin
+
+
+def test_a_full_sequence_reaches_the_promised_accuracy(colon_direct, data_root):
+    """64 frames at 640×480 with highlights and noise; light cos²θ/d², gamma 1/2.2."""
+    assert colon_direct.response.gamma == pytest.approx(1 / 2.2, rel=0.02)
+    assert colon_direct.light.q == pytest.approx(2, rel=0.03)
+    assert colon_direct.light.n == pytest.approx(2, rel=0.05)
+    assert albedo_rmse(colon_direct, data_root / "colon_direct") <= 0.03
+    scores = endotwin.evaluate(colon_direct)
+    assert scores.psnr >= 38.5
+    assert scores.ssim >= 0.97
+    assert scores.psnr_covered >= 41
