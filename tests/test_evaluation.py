@@ -1,0 +1,119 @@
+"""Scores of twins whose error is known beforehand, because the photos are their own renderings."""
+
+import json
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+import tube_sequence
+
+from endotwin.errors import TwinError
+from endotwin.evaluation import evaluate
+from endotwin.pipeline import fuse_twin
+from endotwin.render import Renderer
+from endotwin.twin import Light, Materials, Response, Twin
+
+JSON_KEYS = ["psnr", "ssim", "lpips", "psnr_covered", "covered", "gamma", "light", "frames"]
+
+
+@pytest.fixture(scope="module")
+def twin(tmp_path_factory) -> Twin:
+    """A twin with known materials, and photos of its sequence that are its own renderings in 8 bit."""
+    folder = tube_sequence.write(tmp_path_factory.mktemp("evaluation") / "tube", frames=10)
+    twin = fuse_twin(folder)
+    z = twin.surface.vertices_mm[:, 2]
+    color = np.stack([0.5 + 0.2 * np.sin(z), 0.4 + 0.1 * np.cos(z), 0.3 + 0 * z], axis=1).astype(np.float32)
+    materials = Materials(color, np.full(len(z), 0.6, np.float32), np.zeros(len(z), np.float32))
+    twin = replace(twin, materials=materials, light=Light(40.0, 2.0, 2.0), response=Response(1 / 2.2))
+    renderer, sequence = Renderer(twin), twin.source.open()
+    for index in twin.source.heldout(len(sequence)):
+        render = renderer.view(sequence.T_world_camera[index]).color
+        cv2.imwrite(str(sequence.color_files[index]), np.uint8(render * 255 + 0.5)[..., ::-1])
+    return twin
+
+
+def test_a_twin_predicts_its_own_renderings_to_the_last_bit_of_the_photo(twin):
+    evaluation = evaluate(twin)
+    rounding_db = -10 * np.log10((1 / 255) ** 2 / 12)
+    assert [frame.index for frame in evaluation.frames] == [0, 8]
+    assert evaluation.psnr == pytest.approx(rounding_db, abs=1.0)
+    assert evaluation.ssim > 0.998
+
+
+def test_a_wrong_response_costs_what_its_closed_form_says(twin):
+    darker = replace(twin, light=replace(twin.light, L0=twin.light.L0 * 0.8))
+    sequence, renderer = twin.source.open(), Renderer(twin)
+    frame = sequence.frame(0)
+    valid = sequence.lens_mask & np.isfinite(frame.depth_mm)
+    color = renderer.view(frame.T_world_camera, valid).color[valid]
+    error = color * (1 - 0.8 ** (1 / 2.2))
+    expected = -10 * np.log10(np.mean(error**2))
+    assert color.max() < 1
+    assert evaluate(darker).frames[0].psnr == pytest.approx(expected, abs=0.15)
+
+
+def test_covered_pixels_are_those_whose_surface_a_training_photo_saw(twin):
+    unseen_beyond_mm = 25.0
+    z_mm = twin.surface.vertices_mm[:, 2] + twin.surface.origin_mm[2]
+    seen_by = np.where(z_mm < unseen_beyond_mm, np.maximum(twin.surface.seen_by, 1), 0).astype(np.int32)
+    half = replace(twin, surface=replace(twin.surface, seen_by=seen_by))
+    sequence = twin.source.open()
+    camera, T_world_camera = sequence.camera, sequence.T_world_camera[0]
+    _, depth_mm = tube_sequence.photograph(
+        tube_sequence.camera_json(camera.width, camera.height), T_world_camera
+    )
+    world = camera.pixel_directions @ T_world_camera[:3, :3].T
+    point_z_mm = T_world_camera[2, 3] + depth_mm / camera.pixel_directions[..., 2] * world[..., 2]
+    hit = Renderer(twin).view(T_world_camera).mask
+    expected = (hit & (point_z_mm < unseen_beyond_mm)).mean()
+    assert evaluate(half).frames[0].covered == pytest.approx(expected, abs=0.02)
+
+
+def test_missing_surface_is_black_and_counts_as_error(twin):
+    surface = twin.surface
+    cut = (surface.vertices_mm[:, 2] + surface.origin_mm[2])[surface.triangles].min(axis=1) < 25.0
+    torn = replace(twin, surface=replace(surface, triangles=surface.triangles[cut]))
+    sequence = twin.source.open()
+    frame = sequence.frame(0)
+    valid = sequence.lens_mask & np.isfinite(frame.depth_mm)
+    view = Renderer(torn).view(frame.T_world_camera, valid)
+    missing = valid & ~view.mask
+    inside = cv2.erode(missing.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    error = view.color.astype(np.float64) - frame.color / 255
+    assert inside.sum() > 0.02 * valid.sum() and not view.color[inside].any()
+    assert evaluate(torn).frames[0].psnr == pytest.approx(
+        -10 * np.log10((error[valid] ** 2).mean()), abs=1e-3
+    )
+
+
+def test_the_scores_are_plain_json_and_the_table_says_the_same(twin):
+    evaluation = evaluate(twin)
+    scores = json.loads(json.dumps(evaluation.to_dict(), allow_nan=False))
+    assert list(scores) == JSON_KEYS
+    assert scores["light"] == {"L0": 40.0, "n": 2.0, "q": 2.0}
+    assert scores["psnr"] == pytest.approx(np.mean([frame["psnr"] for frame in scores["frames"]]))
+    assert f"{scores['psnr']:.2f}" in str(evaluation)
+    assert f"{scores['psnr']:.2f} dB" in str(twin.with_record(eval=scores))
+
+
+def test_the_contact_sheet_has_a_row_a_frame_and_three_pictures_a_row(twin, tmp_path):
+    evaluation = evaluate(twin, sheet=tmp_path / "sheet.png")
+    sheet = cv2.imread(str(tmp_path / "sheet.png"))
+    assert sheet.shape == (240 * len(evaluation.frames), 3 * 320, 3)
+    photo, render = sheet[:200, :320].astype(int), sheet[:200, 320:640].astype(int)
+    assert np.abs(photo - render).mean() < 1
+
+
+def test_a_held_out_frame_without_depth_is_skipped_and_named(twin, tmp_path, caplog):
+    folder = tube_sequence.write(tmp_path / "tube", frames=10)
+    depth = cv2.imread(str(folder / "0008_depth.tiff"), cv2.IMREAD_UNCHANGED)
+    cv2.imwrite(str(folder / "0008_depth.tiff"), np.zeros_like(depth))
+    moved = replace(twin, source=replace(twin.source, path=str(folder)))
+    assert [frame.index for frame in evaluate(moved).frames] == [0]
+    assert "0008_color.png" in caplog.text
+
+
+def test_a_twin_without_materials_cannot_be_scored(twin):
+    with pytest.raises(TwinError, match="endotwin fit"):
+        evaluate(replace(twin, materials=None))
