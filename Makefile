@@ -1,0 +1,29 @@
+# make demo: the whole job on the bundled example.   make test: the test suite.   Both make .venv first.
+PYTHON ?= $(shell command -v python3.11 || command -v python3)
+BIN := .venv/bin
+TORCH := torch==2.13.0
+
+.DEFAULT_GOAL := help
+.PHONY: help venv demo test clean
+
+help:
+	@echo "make demo   fuse, fit, eval, synth and inspect the bundled example; results in demo/"
+	@echo "make test   run the test suite"
+	@echo "make venv   only make .venv with the pinned dependencies"
+	@echo "make clean  remove .venv and demo/"
+
+venv: .venv/.installed
+
+.venv/.installed: pyproject.toml constraints.txt
+	$(PYTHON) -m venv .venv
+	$(BIN)/python -m pip install --disable-pip-version-check -q -c constraints.txt $(TORCH) -e '.[dev]'
+	@touch $@
+
+demo: venv
+	$(BIN)/python examples/demo.py
+
+test: venv
+	$(BIN)/python -m pytest
+
+clean:
+	rm -rf .venv demo

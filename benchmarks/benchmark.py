@@ -1,0 +1,146 @@
+"""What endotwin's accuracy costs: run the pipeline on sequences with truth and print a markdown table.
+
+    python benchmarks/benchmark.py DATA/colon_direct
+    python benchmarks/benchmark.py DATA/colon_direct --method twin --method endopbr --budget 60
+
+Each command runs in its own process from cold files, so that its seconds and its peak memory are its own.
+Only this script reads the truth (``truth/``: albedo and roughness of some frames; ``made.json``: the light).
+"""
+
+import argparse
+import json
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from endotwin.evaluation import covered_pixels
+from endotwin.fusion._open3d import o3d
+from endotwin.render import Renderer
+from endotwin.twin import Twin
+
+GAMMA, FALLOFF = 1 / 2.2, 2.0
+"""Truth of sequences whose made.json does not tell."""
+
+METHODS = ("twin", "endopbr")
+
+
+def run(*arguments: object, profile: Path) -> tuple[str, float, dict]:
+    """One endotwin command: what it printed, its seconds (Python's start included), its profile."""
+    command = [sys.executable, "-m", "endotwin.cli.main", *map(str, arguments), "--profile", str(profile)]
+    started = time.perf_counter()
+    done = subprocess.run(command, stdout=subprocess.PIPE, text=True, encoding="utf-8")
+    if done.returncode:
+        sys.exit(f"{' '.join(command)} failed")
+    return done.stdout, time.perf_counter() - started, json.loads(profile.read_text())
+
+
+def material_errors(twin: Twin, truth: Path) -> tuple[float, float]:
+    """RMSE of albedo, after one global scale, and of roughness, over covered pixels of frames with truth."""
+    sequence, renderer = twin.source.open(), Renderer(twin)
+    fitted_albedo, true_albedo, fitted_roughness, true_roughness = [], [], [], []
+    for file in sorted(truth.glob("*_albedo.png")):
+        frame = sequence.frame(int(file.name.split("_")[0]))
+        valid = sequence.lens_mask & np.isfinite(frame.depth_mm)
+        view = renderer.view(frame.T_world_camera, valid)
+        covered = covered_pixels(view.hits, twin.surface, valid.shape)
+        size = (valid.shape[1], valid.shape[0])
+        albedo = cv2.resize(cv2.imread(str(file))[..., ::-1], size, interpolation=cv2.INTER_AREA) / 255
+        fitted_albedo.append(view.image(view.attribute(twin.materials.base_color))[covered])
+        true_albedo.append(albedo[covered])
+        rough = cv2.imread(str(file).replace("albedo", "roughness"), cv2.IMREAD_GRAYSCALE)
+        fitted_roughness.append(view.image(view.attribute(twin.materials.roughness))[covered])
+        true_roughness.append(cv2.resize(rough, size, interpolation=cv2.INTER_AREA)[covered] / 255)
+    fitted, true = np.concatenate(fitted_albedo).astype(np.float64), np.concatenate(true_albedo)
+    scale = (fitted * true).sum() / (fitted * fitted).sum()
+    roughness_error = np.concatenate(fitted_roughness) - np.concatenate(true_roughness)
+    return float(np.sqrt(np.mean((scale * fitted - true) ** 2))), float(np.sqrt(np.mean(roughness_error**2)))
+
+
+def mesh_error(twin: Twin, truth: Path) -> str:
+    """Mean distance of the measured vertices from the true mesh, where there is one."""
+    if not truth.exists():
+        return "-"
+    scene = o3d.t.geometry.RaycastingScene()
+    scene.add_triangles(o3d.t.geometry.TriangleMesh.from_legacy(o3d.io.read_triangle_mesh(str(truth))))
+    world_mm = (twin.surface.vertices_mm + twin.surface.origin_mm)[~twin.surface.filled].astype(np.float32)
+    return f"{scene.compute_distance(world_mm).numpy().mean():.3f} mm"
+
+
+def true_light(made: dict) -> dict[str, float]:
+    """γ, n and q of the scene's description."""
+    light = made.get("light", {"n": made.get("spread"), "q": FALLOFF})
+    return {"gamma": made.get("gamma", GAMMA), "n": light["n"], "q": light["q"]}
+
+
+def percent(value: float, true: float) -> str:
+    """Relative error as a signed percentage."""
+    return f"{100 * (value / true - 1):+.1f} %"
+
+
+def benchmark(sequence: Path, method: str, options: argparse.Namespace, work: Path) -> dict[str, str]:
+    """One row of the table."""
+    twin_folder, profile = work / f"{sequence.name}-{method}", work / "profile.json"
+    protocol = ["--scale", options.scale, "--geometry", options.geometry]
+    _, fuse_s, fuse = run("fuse", sequence, "-o", twin_folder, "--overwrite", *protocol, profile=profile)
+    budget = [] if options.budget is None else ["--budget", options.budget]
+    _, fit_s, fit = run(
+        "fit", twin_folder, "--method", method, *budget, "--seed", options.seed, profile=profile
+    )
+    printed, eval_s, _ = run("eval", twin_folder, "--json", profile=profile)
+    scores, twin = json.loads(printed), Twin.load(twin_folder)
+    albedo, roughness = material_errors(twin, sequence / "truth")
+    true = true_light(json.loads((sequence / "truth" / "made.json").read_text()))
+    return {
+        "sequence": sequence.name,
+        "method": method if options.budget is None else f"{method}, {options.budget:g} s",
+        "geometry": options.geometry,
+        "fuse": f"{fuse_s:.1f} s",
+        "fit": f"{fit_s:.1f} s",
+        "fuse + fit": f"{fuse_s + fit_s:.1f} s",
+        "eval": f"{eval_s:.1f} s",
+        "peak memory": f"{max(fuse['peak_memory_mb'], fit['peak_memory_mb']) / 1000:.2f} GB",
+        "PSNR": f"{scores['psnr']:.2f} dB",
+        "SSIM": f"{scores['ssim']:.4f}",
+        "PSNR covered": f"{scores['psnr_covered']:.2f} dB",
+        "covered": f"{100 * scores['covered']:.1f} %",
+        "γ": percent(scores["gamma"], true["gamma"]),
+        "n": percent(scores["light"]["n"], true["n"]),
+        "q": percent(scores["light"]["q"], true["q"]),
+        "albedo RMSE": f"{albedo:.4f}",
+        "roughness RMSE": f"{roughness:.4f}",
+        "mesh": mesh_error(twin, sequence / "truth" / "colon.ply"),
+    }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("sequence", nargs="+", type=Path, help="sequence folders with a truth/ folder")
+    parser.add_argument("--method", action="append", choices=METHODS, help="may be repeated (default: twin)")
+    parser.add_argument("--budget", type=float, help="seconds of each fit (default: the method's own)")
+    parser.add_argument("--geometry", default="known", choices=("known", "heldout"))
+    parser.add_argument("--scale", type=float, default=1.0, help="factor on the image size")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--keep", type=Path, metavar="FOLDER", help="keep the twins there")
+    options = parser.parse_args()
+    with tempfile.TemporaryDirectory() as temporary:
+        work = options.keep or Path(temporary)
+        work.mkdir(parents=True, exist_ok=True)
+        header_printed = False
+        for sequence in options.sequence:
+            for method in options.method or ["twin"]:
+                row = benchmark(sequence, method, options, work)
+                if not header_printed:
+                    print("| " + " | ".join(row) + " |\n|" + "---|" * len(row), flush=True)
+                    header_printed = True
+                print("| " + " | ".join(row.values()) + " |", flush=True)
+
+
+if __name__ == "__main__":
+    main()

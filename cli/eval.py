@@ -1,0 +1,72 @@
+"""``endotwin eval``: scores on the held-out photos."""
+
+from __future__ import annotations
+
+import json as json_format
+import logging
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from endotwin.cli import console
+
+from endotwin.errors import OutputError
+from endotwin.output import check_free
+
+if TYPE_CHECKING:
+    from endotwin.twin import Twin
+
+logger = logging.getLogger("endotwin")
+
+
+def evaluate(
+    twin_folder: console.TwinFolder,
+    json: Annotated[
+        bool, typer.Option("--json", help="Print the scores as JSON instead of a table.")
+    ] = False,
+    sheet: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE.png", help="Write a picture: photo, render and error of each held-out frame."
+        ),
+    ] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the picture of --sheet.")] = False,
+    profile: console.Profile = None,
+) -> None:
+    """Score a fitted TWIN on the frames held out of the fit: every 8th, from the first.
+
+    PSNR, SSIM and, with the extra 'lpips', LPIPS: over all pixels with depth, and over those whose surface
+    a training photo saw ("covered"). The scores are kept in the twin.
+
+    Example: endotwin eval twin --sheet sheet.png
+    """
+    if sheet is not None:
+        check_free(sheet, overwrite)
+    with console.command("eval", profile) as run:
+        with run.stage("import"):
+            from endotwin.evaluation import evaluate
+            from endotwin.twin import Twin
+        twin = Twin.load(twin_folder)
+        with run.stage("eval"):
+            evaluation = evaluate(twin, sheet, run.progress)
+        with run.stage("write"):
+            kept = _keep(twin.with_record(eval=evaluation.to_dict()), twin_folder)
+    if json:
+        print(json_format.dumps(evaluation.to_dict()))
+        return
+    print(evaluation)
+    written = [f"the scores to {twin_folder}"] * kept + [f"the contact sheet to {sheet}"] * (
+        sheet is not None
+    )
+    if written:
+        print("wrote", " and ".join(written))
+
+
+def _keep(twin: Twin, folder: Path) -> bool:
+    """Save the twin with its scores, unless its folder lies where one may only read."""
+    try:
+        twin.save(folder, overwrite=True)
+    except OutputError as error:
+        logger.warning("The scores are not kept in the twin: %s", error)
+        return False
+    return True

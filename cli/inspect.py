@@ -1,0 +1,46 @@
+"""``endotwin inspect``: look at a twin."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from endotwin.cli import console
+
+from endotwin.output import check_free
+
+
+def inspect(
+    twin_folder: console.TwinFolder,
+    screenshot: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE.png", help="Draw off-screen into FILE.png instead of opening a window."),
+    ] = None,
+    map: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAME",
+            help="Show base_color, roughness, metallic, coverage or normals.",
+            show_default="all",
+        ),
+    ] = None,
+    overwrite: console.Overwrite = False,
+    profile: console.Profile = None,
+) -> None:
+    """Show TWIN's mesh with its maps and the camera path; a key steps through the maps.
+
+    Example: endotwin inspect twin --screenshot twin.png --map roughness
+    """
+    if screenshot is not None:
+        check_free(screenshot, overwrite)
+    with console.command("inspect", profile) as run:
+        with run.stage("import"):
+            from endotwin.inspector import inspect
+            from endotwin.twin import Twin
+        with run.stage("load"):
+            twin = Twin.load(twin_folder)
+        with run.stage("draw"):
+            inspect(twin, screenshot, map, overwrite)
+    if screenshot is not None:
+        print(f"wrote {screenshot}: {map or 'all maps'} of {twin.surface}")

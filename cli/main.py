@@ -1,0 +1,85 @@
+"""The ``endotwin`` command. Errors that a user can mend end here, as one line and exit code 2."""
+
+from __future__ import annotations
+
+import signal
+import sys
+from typing import Annotated
+
+import typer
+from endotwin.cli.eval import evaluate
+from endotwin.cli.fit import fit
+from endotwin.cli.fuse import fuse
+from endotwin.cli.inspect import inspect
+from endotwin.cli.synth import synth
+
+from endotwin.errors import EndotwinError
+
+app = typer.Typer(
+    name="endotwin",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+for name, function in {
+    "fuse": fuse,
+    "fit": fit,
+    "eval": evaluate,
+    "synth": synth,
+    "inspect": inspect,
+}.items():
+    app.command(name)(function)
+
+
+class Stopped(BaseException):
+    """The user, or the system, asked the command to stop."""
+
+
+def _stop(number: int, _frame) -> None:
+    raise Stopped(number)
+
+
+def _show_version(wanted: bool) -> None:
+    if wanted:
+        import endotwin
+
+        print(f"endotwin {endotwin.__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def describe(
+    version: Annotated[
+        bool,
+        typer.Option("--version", callback=_show_version, is_eager=True, help="Print the version and exit."),
+    ] = False,
+) -> None:
+    """Turn a posed endoscopic RGB-D sequence into a relightable twin, and the twin into labelled datasets.
+
+    The usual order: fuse, fit, eval, synth; inspect at any time. 'endotwin COMMAND --help' explains each.
+    """
+
+
+def main() -> None:
+    """Run the command line; exit code 2 and one line on stderr for every error that a user can mend."""
+    signal.signal(signal.SIGINT, _stop)
+    signal.signal(signal.SIGTERM, _stop)
+    try:
+        app()
+    except EndotwinError as error:
+        print("error:", " ".join(str(error).split()), file=sys.stderr)
+        sys.exit(2)
+    except OSError as error:  # the disk is full, a folder became read-only
+        print(
+            f"error: {error.filename or 'a file'} cannot be read or written ({error.strerror})",
+            file=sys.stderr,
+        )
+        sys.exit(2)
+    except Stopped as stopped:
+        print("stopped; nothing was written", file=sys.stderr)
+        sys.exit(128 + stopped.args[0])
+
+
+if __name__ == "__main__":
+    main()

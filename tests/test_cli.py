@@ -1,0 +1,390 @@
+"""The command line: the whole afternoon of a user, and every mistake that a user can make."""
+
+import errno
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import tifffile
+import tube_sequence
+from endotwin.cli import console
+from endotwin.cli.main import main
+
+FRAMES = 10
+
+
+@pytest.fixture(autouse=True)
+def signals() -> Iterator[None]:
+    """``main`` takes SIGINT and SIGTERM over; give them back to the test runner."""
+    kept = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    yield
+    for number, handler in kept.items():
+        signal.signal(number, handler)
+
+
+def invoke(*arguments: object) -> int:
+    """Run the command line in this process; its exit code."""
+    with pytest.MonkeyPatch.context() as patch, pytest.raises(SystemExit) as exit_:
+        patch.setattr(sys, "argv", ["endotwin", *map(str, arguments)])
+        main()
+    return exit_.value.code or 0
+
+
+@pytest.fixture
+def endotwin(capfd) -> Callable[..., tuple[int, str, str]]:
+    """``invoke``, which also gives what was printed: exit code, stdout, stderr."""
+
+    def run(*arguments: object) -> tuple[int, str, str]:
+        capfd.readouterr()
+        code = invoke(*arguments)
+        return code, *capfd.readouterr()
+
+    return run
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory) -> Path:
+    """A folder with a sequence ``tube`` and its fitted twin ``twin``; tests must not change them."""
+    folder = tmp_path_factory.mktemp("made")
+    tube_sequence.write(folder / "tube", FRAMES)
+    assert invoke("fuse", folder / "tube", "-o", folder / "twin") == 0
+    assert invoke("fit", folder / "twin", "--budget", 3) == 0
+    return folder
+
+
+@pytest.fixture
+def tube(tmp_path) -> Path:
+    """A sequence that a test may spoil."""
+    return tube_sequence.write(tmp_path / "tube", FRAMES)
+
+
+@pytest.fixture
+def fails(endotwin, tmp_path) -> Callable[..., str]:
+    """Run a command that must fail as promised: exit code 2, one line on stderr, nothing left behind."""
+
+    def run(*arguments: object) -> str:
+        before = sorted(tmp_path.rglob("*"))
+        code, out, err = endotwin(*arguments)
+        assert code == 2, err
+        assert err.startswith("error: ") and err.count("\n") == 1, err
+        assert out == ""
+        assert sorted(tmp_path.rglob("*")) == before
+        return err
+
+    return run
+
+
+def edit_poses(folder: Path, change: Callable[[np.ndarray], None]) -> None:
+    """Rewrite pose.txt after ``change`` has altered its matrices in place."""
+    poses = tube_sequence.poses(FRAMES)
+    change(poses)
+    tube_sequence.write_poses(folder / "pose.txt", poses)
+
+
+# The afternoon
+
+
+def test_a_sequence_becomes_a_twin_scores_a_dataset_and_a_picture(endotwin, made, tmp_path):
+    twin, dataset, sheet, picture = (tmp_path / name for name in ("twin", "dataset", "sheet.png", "twin.png"))
+    shutil.copytree(made / "twin", twin)
+
+    code, out, _ = endotwin("eval", twin, "--json", "--sheet", sheet)
+    scores = json.loads(out)
+    assert code == 0
+    assert list(scores) == ["psnr", "ssim", "lpips", "psnr_covered", "covered", "gamma", "light", "frames"]
+    assert [frame["index"] for frame in scores["frames"]] == [0, 8]
+    assert scores["psnr_covered"] > 25
+    assert sheet.is_file()
+
+    code, out, _ = endotwin(
+        "synth", twin, "--trajectory", "jitter:frames=3", "--light", "intensity*0.8", "-o", dataset
+    )
+    assert code == 0 and str(dataset) in out
+    code, out, err = endotwin(
+        "fuse", dataset, "-o", tmp_path / "again", "--profile", tmp_path / "profile.json"
+    )
+    assert code == 0 and str(tmp_path / "again") in out, err
+    assert json.loads((tmp_path / "profile.json").read_text())["stages"]["fuse"] > 0
+
+    code, out, _ = endotwin("inspect", twin, "--screenshot", picture)
+    assert code == 0 and str(picture) in out
+    assert cv2.imread(str(picture)).std() > 1
+
+
+def test_eval_keeps_the_scores_in_the_twin_and_says_that_lpips_is_missing(
+    endotwin, made, tmp_path, monkeypatch
+):
+    from endotwin import metrics
+    from endotwin.twin import Twin
+
+    monkeypatch.setattr(metrics, "_lpips_network", lambda: None)
+    shutil.copytree(made / "twin", tmp_path / "twin")
+    code, out, _ = endotwin("eval", tmp_path / "twin")
+    assert code == 0 and "not installed" in out
+    kept = Twin.load(tmp_path / "twin").record["eval"]
+    assert kept["lpips"] is None and f"{kept['psnr']:.2f} dB" in repr(Twin.load(tmp_path / "twin"))
+
+
+def test_the_twin_remembers_its_protocol_and_heldout_geometry_uses_fewer_frames(endotwin, tube, tmp_path):
+    from endotwin.twin import Twin
+
+    code, _, err = endotwin("fuse", tube, "-o", tmp_path / "twin", "--geometry", "heldout", "--scale", "0.5")
+    assert code == 0, err
+    twin = Twin.load(tmp_path / "twin")
+    assert (twin.source.geometry, twin.source.scale) == ("heldout", 0.5)
+    assert twin.record["fuse"]["frames"] == FRAMES - 2
+    assert (twin.camera.width, twin.camera.height) == (48, 36)
+
+
+def test_a_frame_that_is_all_invalid_is_skipped_with_a_warning_that_names_it(endotwin, tube, tmp_path):
+    tifffile.imwrite(tube / "0003_depth.tiff", np.zeros((72, 96), np.uint16))
+    code, _, err = endotwin("fuse", tube, "-o", tmp_path / "twin")
+    assert code == 0
+    warnings = [line for line in err.splitlines() if line.startswith("warning: ")]
+    assert len(warnings) == 1 and "0003_depth.tiff" in warnings[0]
+
+
+def test_help_is_instant_because_nothing_slow_is_imported():
+    code = (
+        "import sys; sys.argv = ['endotwin', '--help']\n"
+        "from endotwin.cli.main import main\n"
+        "try: main()\n"
+        "except SystemExit: pass\n"
+        "slow = {'torch', 'open3d', 'vtk', 'pyvista', 'matplotlib', 'numpy', 'scipy', 'cv2', 'skimage'}\n"
+        "sys.exit(f'imported {slow & set(sys.modules)}' if slow & set(sys.modules) else 0)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, encoding="utf-8")
+    assert done.returncode == 0, done.stderr
+    assert all(command in done.stdout for command in ("fuse", "fit", "eval", "synth", "inspect"))
+
+
+@pytest.mark.parametrize("command", ["fuse", "fit", "eval", "synth", "inspect"])
+def test_every_command_explains_itself_with_an_example(endotwin, command):
+    code, out, _ = endotwin(command, "--help")
+    assert code == 0 and f"endotwin {command}" in out and "Example" in out
+
+
+def test_version_is_that_of_the_package(endotwin):
+    from importlib.metadata import version
+
+    assert endotwin("--version")[:2] == (0, f"endotwin {version('endotwin')}\n")
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_stopped_command_leaves_nothing_behind(endotwin, tube, tmp_path, monkeypatch, number, code):
+    monkeypatch.setattr(console.Run, "progress", lambda *_: os.kill(os.getpid(), number))
+    before = sorted(tmp_path.rglob("*"))
+    result = endotwin("fuse", tube, "-o", tmp_path / "twin")
+    assert result == (code, "", "stopped; nothing was written\n")
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_a_full_disk_is_an_error_of_one_line_and_leaves_nothing_behind(fails, made, tmp_path, monkeypatch):
+    from endotwin.surface import Surface
+
+    def save(self: Surface, path: Path) -> None:
+        path.write_bytes(b"half")
+        raise OSError(errno.ENOSPC, "No space left on device", str(path))
+
+    monkeypatch.setattr(Surface, "save", save)
+    assert "No space left" in fails("fuse", made / "tube", "-o", tmp_path / "twin")
+
+
+# Bad input: the sequence
+
+
+def test_no_such_folder(fails, tmp_path):
+    assert "nowhere" in fails("fuse", tmp_path / "nowhere", "-o", tmp_path / "twin")
+
+
+def test_no_frames(fails, tmp_path):
+    (tmp_path / "empty").mkdir()
+    assert "no frames" in fails("fuse", tmp_path / "empty", "-o", tmp_path / "twin")
+
+
+def test_frames_and_poses_of_different_count(fails, tube, tmp_path):
+    lines = (tube / "pose.txt").read_text().splitlines()
+    (tube / "pose.txt").write_text("\n".join(lines[:-1]) + "\n")
+    message = fails("fuse", tube, "-o", tmp_path / "twin")
+    assert "10 frames" in message and "9 poses" in message
+
+
+def test_a_pose_that_is_not_rigid(fails, tube, tmp_path):
+    def stretch(poses: np.ndarray) -> None:
+        poses[4, :3, :3] *= 1.1
+
+    edit_poses(tube, stretch)
+    message = fails("fuse", tube, "-o", tmp_path / "twin")
+    assert "pose.txt" in message and "rigid" in message and "transpose" not in message
+
+
+def test_a_pose_whose_transpose_would_be_rigid(fails, tube, tmp_path):
+    poses = tube_sequence.poses(FRAMES)
+    tube_sequence.write_poses(tube / "pose.txt", poses.swapaxes(1, 2))
+    assert "transpose" in fails("fuse", tube, "-o", tmp_path / "twin")
+
+
+def test_nan_in_a_pose(fails, tube, tmp_path):
+    def spoil(poses: np.ndarray) -> None:
+        poses[2, 0, 3] = np.nan
+
+    edit_poses(tube, spoil)
+    assert "pose.txt" in fails("fuse", tube, "-o", tmp_path / "twin")
+
+
+def test_depth_and_colour_of_different_size(fails, tube, tmp_path):
+    tifffile.imwrite(tube / "0005_depth.tiff", np.full((36, 48), 20000, np.uint16))
+    message = fails("fuse", tube, "-o", tmp_path / "twin")
+    assert "0005_depth.tiff" in message and "48×36" in message
+
+
+@pytest.mark.parametrize("name", ["0006_depth.tiff", "0000_color.png"])
+def test_a_truncated_image(fails, tube, tmp_path, name):
+    file = tube / name
+    file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
+    assert name in fails("fuse", tube, "-o", tmp_path / "twin")
+
+
+def test_a_photo_truncated_after_the_fusion_is_found_by_the_fit(fails, made, tmp_path):
+    shutil.copytree(made / "tube", tmp_path / "tube")
+    shutil.copytree(made / "twin", tmp_path / "twin")
+    twin = tmp_path / "twin" / "twin.json"
+    twin.write_text(twin.read_text().replace(str(made / "tube"), str(tmp_path / "tube")))
+    photo = tmp_path / "tube" / "0003_color.png"
+    photo.write_bytes(photo.read_bytes()[:-100])
+    assert "0003_color.png" in fails("fit", tmp_path / "twin", "--overwrite", "--budget", "3")
+
+
+def test_a_sequence_with_no_valid_depth(fails, tube, tmp_path):
+    for file in tube.glob("*_depth.tiff"):
+        tifffile.imwrite(file, np.full((72, 96), 65535, np.uint16))
+    assert "valid depth" in fails("fuse", tube, "-o", tmp_path / "twin")
+
+
+def test_an_unknown_camera_model(fails, tube, tmp_path):
+    (tube / "camera.json").write_text(json.dumps({"model": "periscope", "width": 96, "height": 72}))
+    message = fails("fuse", tube, "-o", tmp_path / "twin")
+    assert "periscope" in message and "pinhole" in message
+
+
+# Bad input: twins, trajectories, outputs, options
+
+
+def test_a_trajectory_outside_the_mesh(fails, made, tmp_path):
+    poses = tube_sequence.poses(3)
+    poses[1, 0, 3] = 500.0
+    tube_sequence.write_poses(tmp_path / "pose.txt", poses)
+    message = fails("synth", made / "twin", "--trajectory", tmp_path / "pose.txt", "-o", tmp_path / "dataset")
+    assert "pose 1" in message
+
+
+@pytest.mark.parametrize("spec", ["nowhere.txt", "jitter:frames=many", "jitter:colour=3"])
+def test_a_trajectory_that_cannot_be_understood(fails, made, tmp_path, spec):
+    fails("synth", made / "twin", "--trajectory", spec, "-o", tmp_path / "dataset")
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        ["fuse", "{made}/tube", "-o", "{taken}"],
+        ["fit", "{made}/twin", "-o", "{taken}"],
+        ["eval", "{made}/twin", "--sheet", "{taken}"],
+        ["synth", "{made}/twin", "--trajectory", "jitter:", "-o", "{taken}"],
+        ["inspect", "{made}/twin", "--screenshot", "{taken}"],
+    ],
+    ids=lambda command: command[0],
+)
+def test_an_output_that_exists(fails, made, tmp_path, command):
+    taken = tmp_path / "taken"
+    taken.write_text("precious")
+    message = fails(*[part.format(made=made, taken=taken) for part in command])
+    assert "taken" in message and "--overwrite" in message
+    assert taken.read_text() == "precious"
+
+
+def test_overwrite_replaces_an_output(endotwin, made, tmp_path):
+    (tmp_path / "twin").mkdir()
+    (tmp_path / "twin" / "stale").touch()
+    code, _, err = endotwin("fuse", made / "tube", "-o", tmp_path / "twin", "--overwrite")
+    assert code == 0, err
+    assert sorted(entry.name for entry in (tmp_path / "twin").iterdir()) == [
+        "surface.safetensors",
+        "twin.json",
+    ]
+
+
+def test_a_fitted_twin_is_not_fitted_again_by_accident(fails, made):
+    message = fails("fit", made / "twin")
+    assert "--overwrite" in message and "fitted already" in message
+
+
+@pytest.mark.parametrize("command", ["fit", "eval", "inspect"])
+def test_a_twin_from_a_newer_version(fails, made, tmp_path, command):
+    shutil.copytree(made / "twin", tmp_path / "twin")
+    file = tmp_path / "twin" / "twin.json"
+    file.write_text(json.dumps({**json.loads(file.read_text()), "version": 99}))
+    message = fails(command, tmp_path / "twin")
+    assert "99" in message and "update endotwin" in message
+
+
+@pytest.mark.parametrize("command", ["fit", "eval", "inspect"])
+def test_a_folder_that_is_no_twin(fails, made, command):
+    assert "not a twin" in fails(command, made / "tube")
+
+
+def test_a_damaged_twin(fails, made, tmp_path):
+    shutil.copytree(made / "twin", tmp_path / "twin")
+    surface = tmp_path / "twin" / "surface.safetensors"
+    surface.write_bytes(surface.read_bytes()[:1000])
+    assert "damaged" in fails("eval", tmp_path / "twin")
+
+
+def test_an_unfitted_twin_has_no_scores_and_no_dataset(fails, endotwin, made, tmp_path):
+    assert endotwin("fuse", made / "tube", "-o", tmp_path / "twin")[0] == 0
+    assert "endotwin fit" in fails("eval", tmp_path / "twin")
+    assert "endotwin fit" in fails(
+        "synth", tmp_path / "twin", "--trajectory", "jitter:", "-o", tmp_path / "dataset"
+    )
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        ["fuse", "{made}/tube", "-o", "{new}", "--scale", "0"],
+        ["fuse", "{made}/tube", "-o", "{new}", "--scale", "nan"],
+        ["fuse", "{made}/tube", "-o", "{new}", "--voxel", "-1"],
+        ["fuse", "{made}/tube", "-o", "{new}", "--geometry", "guessed"],
+        ["fuse", "{made}/tube", "-o", "{new}", "--format", "betamax"],
+        ["fit", "{made}/twin", "-o", "{new}", "--method", "magic"],
+        ["fit", "{made}/twin", "-o", "{new}", "--budget", "0"],
+        ["fit", "{made}/twin", "-o", "{new}", "--epochs", "0"],
+        ["synth", "{made}/twin", "--trajectory", "jitter:", "-o", "{new}", "--material", "gloss*2"],
+        ["synth", "{made}/twin", "--trajectory", "jitter:", "-o", "{new}", "--light", "intensity"],
+        ["inspect", "{made}/twin", "--screenshot", "{new}.png", "--map", "temperature"],
+    ],
+    ids=lambda options: " ".join(options[:1] + options[-2:]),
+)
+def test_an_option_whose_value_makes_no_sense(fails, made, tmp_path, options):
+    fails(*[part.format(made=made, new=tmp_path / "new") for part in options])
+
+
+def test_a_mistyped_option_is_a_usage_error(endotwin):
+    code, _, err = endotwin("fuse", "--outptu", "x")
+    assert code == 2 and "Traceback" not in err
+
+
+def test_the_installed_command_reports_errors_without_a_traceback(tmp_path):
+    command = Path(sys.executable).with_name("endotwin")
+    done = subprocess.run(
+        [command, "eval", tmp_path / "nothing"], capture_output=True, text=True, encoding="utf-8"
+    )
+    assert done.returncode == 2
+    assert done.stderr.startswith("error: ") and done.stderr.count("\n") == 1
