@@ -62,6 +62,11 @@ class Surface:
         T_local_camera[:3, 3] -= self.origin_mm
         return T_local_camera
 
+    def normal_agreement(self) -> np.ndarray:
+        """Least cosine between two corners' normals of each triangle, float32 [F]: 1 where it is flat."""
+        normals = self.normals[self.triangles]
+        return np.einsum("fik,fik->fi", normals, np.roll(normals, 1, axis=1)).min(axis=1)
+
     def with_coverage(self, seen_by: np.ndarray, best_cosine: np.ndarray, nearest_mm: np.ndarray) -> Surface:
         """The same surface with other coverage [V] each."""
         return replace(self, seen_by=seen_by, best_cosine=best_cosine, nearest_mm=nearest_mm)

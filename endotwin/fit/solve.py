@@ -53,7 +53,7 @@ CONVERGED = 2e-4
 
 
 @dataclass(frozen=True)
-class _Progress:
+class _Clock:
     """Clock and reporting of one fit."""
 
     stopwatch: Stopwatch
@@ -72,7 +72,7 @@ def fit_twin(twin: Twin, budget_s: float | None, seed: int, progress: Progress |
         SequenceError: the training photos show nothing of the surface.
     """
     stopwatch = Stopwatch()
-    clock = _Progress(stopwatch, budget_s, progress)
+    clock = _Clock(stopwatch, budget_s, progress)
     surface = twin.surface
     with stopwatch.stage("gather"):
         samples = gather(twin, DETAIL_PIXELS, seed, progress)
@@ -100,13 +100,11 @@ def fit_twin(twin: Twin, budget_s: float | None, seed: int, progress: Progress |
 
 def _telling(samples: Samples, surface: Surface) -> np.ndarray:
     """Bool [N]: samples off the creases of the surface and below saturation."""
-    normals = surface.normals[surface.triangles]
-    agreement = np.einsum("fik,fik->fi", normals, np.roll(normals, 1, axis=1)).min(axis=1)
-    smooth = agreement > np.cos(np.radians(CERTAIN_NORMAL_DEG))
+    smooth = surface.normal_agreement() > np.cos(np.radians(CERTAIN_NORMAL_DEG))
     return smooth[samples.triangle.numpy()] & (samples.color.numpy().max(axis=1) < BRIGHT)
 
 
-def _find_light(samples: Samples, surface: Surface, start: Start, clock: _Progress) -> tuple[State, float]:
+def _find_light(samples: Samples, surface: Surface, start: Start, clock: _Clock) -> tuple[State, float]:
     """Light, response, f0 and coarse materials; and the seconds that a step without the light takes."""
     points, group = proxies(surface.vertices_mm, LIGHT_CELL_MM / PROXIES)
     operator = HashOperator.of(points, LIGHT_GRID)
@@ -129,7 +127,7 @@ def _find_light(samples: Samples, surface: Surface, start: Start, clock: _Progre
     return state, step_s * len(surface.vertices_mm) / len(points)
 
 
-def _find_detail(samples: Samples, surface: Surface, state: State, step_s: float, clock: _Progress) -> State:
+def _find_detail(samples: Samples, surface: Surface, state: State, step_s: float, clock: _Clock) -> State:
     """The state with finer features on top, as fine as the mesh; light, response and the coarse features
     stay.
     """

@@ -24,9 +24,7 @@ NORMAL_ROUNDS = 4
 
 def crumple_deg(surface: Surface) -> float:
     """Median, over the triangles, of the largest angle between two corners' normals."""
-    normals = surface.normals[surface.triangles]
-    agreement = np.einsum("fik,fik->fi", normals, np.roll(normals, 1, axis=1)).min(axis=1)
-    return float(np.degrees(np.arccos(np.clip(np.median(agreement), -1, 1))))
+    return float(np.degrees(np.arccos(np.clip(np.median(surface.normal_agreement()), -1, 1))))
 
 
 def smoothed(surface: Surface) -> Surface:
