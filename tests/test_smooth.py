@@ -45,3 +45,24 @@ def test_smoothing_keeps_the_radius_within_the_noise(sphere):
     radius_mm = np.linalg.norm(mended.vertices_mm, axis=1)
     assert abs(radius_mm.mean() - RADIUS_MM) < 0.005
     assert radius_mm.std() < 0.05 / 2
+
+
+def test_curvature_is_no_crumple():
+    coarse = trimesh.creation.icosphere(subdivisions=3, radius=RADIUS_MM)
+    surface = surface_of(np.zeros(3), np.asarray(coarse.vertices, np.float32), coarse.faces)
+    bend_deg = np.degrees(np.arccos(surface.normal_agreement().min()))
+    assert bend_deg > 4 * CRUMPLED_DEG
+    assert smoothed(surface) is surface
+
+
+def test_a_crumb_that_smoothing_shrinks_to_nothing_is_dropped(sphere):
+    noisy = crumpled(sphere, 0.05)
+    crumb = np.array([[9, 9, 9], [9.1, 9, 9], [9, 9.1, 9]], np.float32)
+    surface = surface_of(
+        np.zeros(3),
+        np.concatenate([noisy.vertices_mm, crumb]),
+        np.concatenate([noisy.triangles, [[len(noisy.vertices_mm) + k for k in range(3)]]]),
+    )
+    mended = smoothed(surface)
+    np.testing.assert_allclose(np.linalg.norm(mended.normals, axis=1), 1, atol=1e-5)
+    assert len(mended.triangles) == len(noisy.triangles)
