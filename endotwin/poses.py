@@ -2,22 +2,39 @@
 
 from __future__ import annotations
 
-import json
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from endotwin.errors import SequenceError, TrajectoryError
+from endotwin.jsontext import parsed
 
 RIGID_TOLERANCE = 1e-3
+LARGEST = 1e12
+"""Beyond it no number of a pose or a time makes sense, and float64 is coarser than a micrometre."""
 FRAMES_PER_SECOND = 30.0  # assumed where a format has no times
 MM_PER_UNIT = {"m": 1000.0, "mm": 1.0}
 AXES_OPENGL_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 C3VD_ROW = "16 comma-separated numbers, the camera-to-world matrix column by column"
 TUM_ROW = "'timestamp tx ty tz qx qy qz qw'"
+
+_AS_WRITTEN = ContextVar("as_written", default=False)
+
+
+@contextmanager
+def poses_as_written() -> Iterator[None]:
+    """Within the block, readers return matrices that are not rigid as they are: to tell what is wrong with
+    them."""
+    token = _AS_WRITTEN.set(True)
+    try:
+        yield
+    finally:
+        _AS_WRITTEN.reset(token)
 
 
 def read_poses(path: Path | str) -> tuple[np.ndarray, np.ndarray]:
@@ -63,12 +80,19 @@ def rigid(matrices: np.ndarray, where: Callable[[int], str]) -> np.ndarray:
     _require(
         np.isfinite(matrices).all(axis=(1, 2)), where, "has a NaN or infinity; remove or mend that frame"
     )
+    _require(
+        (np.abs(matrices) <= LARGEST).all(axis=(1, 2)), where, "is far out of any scene; mend its position"
+    )
+    if _AS_WRITTEN.get():
+        return matrices
     bad = ~_is_rigid(matrices)
     if bad.any():
         first = int(bad.argmax())
         remedy = "mend the rotation or remove that frame"
         if _is_rigid(matrices[first : first + 1].transpose(0, 2, 1))[0]:
             remedy = "its transpose would be, so write the file's matrices transposed, rows as columns"
+        elif np.linalg.det(matrices[first, :3, :3]) < 0:
+            remedy = "its axes are left-handed (determinant −1), so mirror one axis of world and camera alike"
         raise SequenceError(f"{where(first)}: the pose is not rigid; {remedy}")
     left, _, right = np.linalg.svd(matrices[:, :3, :3])
     matrices[:, :3, :3] = left @ right
@@ -118,7 +142,9 @@ def read_transforms_poses(path: Path) -> tuple[np.ndarray, list[dict]]:
     content = read_json(path)
     frames = content.get("frames")
     if not isinstance(frames, list) or not all(isinstance(frame, dict) for frame in frames):
-        raise SequenceError(f"{path} has no list 'frames'; export the file again")
+        raise SequenceError(
+            f"{path} has no list 'frames', as a transforms.json has; export it, or name the folder"
+        )
     frames = sorted(frames, key=lambda frame: natural_order(str(frame.get("file_path", ""))))
     matrices = np.zeros((len(frames), 4, 4))
     for index, frame in enumerate(frames):
@@ -156,7 +182,7 @@ def numeric_rows(path: Path, columns: int, valid_row: str) -> tuple[np.ndarray, 
             row = [float(word) for word in _words(line)]
         except ValueError:
             row = []
-        if len(row) != columns:
+        if len(row) != columns or any(LARGEST < abs(value) < np.inf for value in row):
             raise SequenceError(
                 f"{path}, line {number}: not a valid row, which is {valid_row}; mend that line"
             )
@@ -178,8 +204,8 @@ def read_text(path: Path) -> str:
 def read_json(path: Path) -> dict:
     """The object in a JSON file; raises SequenceError where there is none."""
     try:
-        content = json.loads(read_text(path))
-    except json.JSONDecodeError as error:
+        content = parsed(read_text(path))
+    except ValueError as error:
         raise SequenceError(f"{path} is not JSON ({error}); export the file again") from error
     if not isinstance(content, dict):
         raise SequenceError(f"{path} holds no JSON object; export the file again")

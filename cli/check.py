@@ -1,0 +1,71 @@
+"""``endotwin check``: whether poses, intrinsics, depth and photos agree."""
+
+from __future__ import annotations
+
+import json as json_format
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from endotwin.cli import console
+
+if TYPE_CHECKING:
+    from endotwin.check import Report
+
+
+def check(
+    sequence: Annotated[
+        Path,
+        typer.Argument(
+            metavar="SEQUENCE",
+            show_default=False,
+            help="Folder (or transforms.json) of a sequence, or of a dataset from 'endotwin synth'.",
+        ),
+    ],
+    format: Annotated[
+        str | None,
+        typer.Option(metavar="NAME", help="c3vd, transforms, simcol or tum.", show_default="detected"),
+    ] = None,
+    json: Annotated[
+        bool, typer.Option("--json", help="Print the findings as JSON instead of a table.")
+    ] = False,
+    profile: console.Profile = None,
+) -> None:
+    """Tell whether a SEQUENCE's poses, intrinsics, depth unit and photos agree, and if not, what to change.
+
+    Frames are warped onto each other through depth, as written and under the usual mistakes. Exit code 0: all
+    agrees; 1: there is something to mend; 2: the sequence cannot be read.
+
+    Example: endotwin check examples/colon_small
+    """
+    with console.command("check", profile) as run:
+        with run.stage("import"):
+            from endotwin.check import check
+        with run.stage("check"):
+            report = check(sequence, format, run.progress)
+    if json:
+        print(json_format.dumps(report.to_dict()))
+    else:
+        _show(report)
+    raise typer.Exit(0 if report.consistent else 1)
+
+
+def _show(report: Report) -> None:
+    """The measures as a table, then one sentence a finding, and what to change."""
+    from rich.console import Console
+    from rich.markup import escape
+    from rich.table import Table
+
+    out = Console(highlight=False)
+    out.print(escape(report.sequence), soft_wrap=True)
+    if report.measures:
+        table = Table("measured", "as written", "as best read", box=None, pad_edge=False)
+        for row in report.measures:
+            table.add_row(*map(escape, row))
+        out.print(table)
+    out.print(f"[bold]{escape(report.verdict)}[/]", soft_wrap=True)
+    for number, finding in enumerate(report.findings, 1):
+        out.print(f"{number}. [bold]{finding.kind}[/]: {escape(finding.says)}", soft_wrap=True)
+        out.print(f"   → {escape(finding.change)}", soft_wrap=True)
+    for note in report.notes:
+        out.print(f"note: {escape(note)}", soft_wrap=True)
