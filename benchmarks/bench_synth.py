@@ -1,40 +1,83 @@
-"""Frames a second and peak memory of synth: ``python benchmarks/bench_synth.py TWIN [FRAMES ...]``."""
+"""Frames a second and memory of synth: ``python benchmarks/bench_synth.py TWIN --frames N --workers N``."""
 
 from __future__ import annotations
 
 import argparse
+import resource
 import tempfile
 import time
 from pathlib import Path
 
-from endotwin.stopwatch import peak_memory_mb
-from endotwin.synth import parse_trajectory, synthesize
+import psutil
+
+from endotwin.synth import DEFAULT_LABELS, parse_labels, parse_trajectory, synthesize
 from endotwin.twin import Twin
+
+PAPER_FRAMES = 18_000
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("twin", type=Path, help="a fitted twin whose sequence is still there")
-    parser.add_argument("frames", type=int, nargs="*", default=[50, 200], help="sizes of the datasets")
-    parser.add_argument("--rounds", type=int, default=3, help="times that each is made; the best counts")
+    parser.add_argument("--frames", type=int, default=1000)
+    parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--labels", default=",".join(DEFAULT_LABELS))
+    parser.add_argument("--layout", default="c3vd")
+    parser.add_argument(
+        "--folder", type=Path, help="where to write; the system's temporary folder unless given"
+    )
     arguments = parser.parse_args()
     twin = Twin.load(arguments.twin)
-    size = f"{twin.camera.width}×{twin.camera.height}"
-    print(f"{twin.surface}, {size}; memory before: {peak_memory_mb():.0f} MB")
-    for frames in arguments.frames:
-        trajectory = parse_trajectory(f"jitter:frames={frames}", twin, seed=0)
-        wall, cpu = [], []
-        for _ in range(arguments.rounds):
-            with tempfile.TemporaryDirectory() as folder:
-                start = time.perf_counter(), time.process_time()
-                summary = synthesize(twin, trajectory, Path(folder) / "dataset")
-                wall.append(time.perf_counter() - start[0])
-                cpu.append(time.process_time() - start[1])
-        print(
-            f"{frames} frames, best of {arguments.rounds}: {frames / min(wall):.1f} frames/s, "
-            f"{min(cpu) / frames * 1e3:.0f} ms of one core each, "
-            f"{summary.bytes / frames / 1e6:.2f} MB a frame, peak memory {peak_memory_mb():.0f} MB"
+    started = time.perf_counter()
+    trajectory = parse_trajectory(f"jitter:frames={arguments.frames}", twin, seed=0)
+    drawn_s = time.perf_counter() - started
+    memory_mb, first = [], []
+
+    def progress(label: str, done: int, total: int) -> None:
+        first.append((time.perf_counter(), done))
+        memory_mb.append(memory_of_all_mb())
+
+    with tempfile.TemporaryDirectory(dir=arguments.folder) as folder:
+        started, cpu_s = time.perf_counter(), all_cpu_s()
+        summary = synthesize(
+            twin,
+            trajectory,
+            Path(folder) / "dataset",
+            labels=parse_labels(arguments.labels),
+            layout=arguments.layout,
+            workers=arguments.workers,
+            progress=progress,
         )
+        wall_s, cpu_s = time.perf_counter() - started, all_cpu_s() - cpu_s
+    (began, done), (ended, total) = first[0], first[-1]
+    rate = (total - done) / (ended - began) if ended > began else 0
+    quarter = max(len(memory_mb) // 4, 1)
+    size = f"{twin.camera.width}×{twin.camera.height}"
+    print(
+        f"{twin.surface}, {size}; {arguments.layout}: {arguments.labels}; load {psutil.getloadavg()[0]:.1f}"
+    )
+    print(f"poses drawn and judged in {drawn_s:.1f} s; {summary}")
+    print(
+        f"{arguments.workers} workers: {wall_s:.1f} s with their start, "
+        f"{arguments.frames / wall_s:.1f} frames/s; {rate:.1f} frames/s once at work, "
+        f"{PAPER_FRAMES} frames in {PAPER_FRAMES / rate / 60:.1f} min; "
+        f"{cpu_s / arguments.frames * 1e3:.0f} ms of a core each"
+    )
+    print(
+        f"memory of all processes: {max(memory_mb[:quarter]):.0f} MB at most in the first quarter, "
+        f"{max(memory_mb[-quarter:]):.0f} MB in the last"
+    )
+
+
+def all_cpu_s() -> float:
+    """Seconds of cores that this process and its ended children took."""
+    return sum(sum(resource.getrusage(who)[:2]) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
+
+
+def memory_of_all_mb() -> float:
+    """Resident memory of this process and its children, MB."""
+    this = psutil.Process()
+    return sum(each.memory_info().rss for each in [this, *this.children(recursive=True)]) / 1e6
 
 
 if __name__ == "__main__":

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 from endotwin.cli import console
 
-from endotwin.output import check_free
+from endotwin.output import check_picture
 
 
 def inspect(
@@ -25,6 +25,12 @@ def inspect(
             show_default="all",
         ),
     ] = None,
+    keyframes: Annotated[
+        Path,
+        typer.Option(
+            metavar="FILE", help="Pose file that the key k adds the view to, for 'synth' spline:FILE."
+        ),
+    ] = Path("keyframes.txt"),
     overwrite: console.Overwrite = False,
     profile: console.Profile = None,
 ) -> None:
@@ -33,7 +39,7 @@ def inspect(
     Example: endotwin inspect twin --screenshot twin.png --map roughness
     """
     if screenshot is not None:
-        check_free(screenshot, overwrite)
+        check_picture(screenshot, overwrite)
     with console.command("inspect", profile) as run:
         with run.stage("import"):
             from endotwin.inspector import inspect
@@ -41,6 +47,6 @@ def inspect(
         with run.stage("load"):
             twin = Twin.load(twin_folder)
         with run.stage("draw"):
-            inspect(twin, screenshot, map, overwrite)
+            inspect(twin, screenshot, map, overwrite, keyframes)
     if screenshot is not None:
         print(f"wrote {screenshot}: {map or 'all maps'} of {twin.surface}")

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,8 +11,9 @@ import pyvista as pv
 from vtkmodules.vtkCommonCore import vtkLogger
 
 from endotwin.cameras import Camera
-from endotwin.errors import OptionError, OutputError, SequenceError, TrajectoryError
-from endotwin.output import check_free, whole_file
+from endotwin.errors import EndotwinError, OptionError, OutputError, SequenceError, TrajectoryError
+from endotwin.output import check_picture, whole_file
+from endotwin.poses import read_poses, write_c3vd_poses
 from endotwin.synth.flight import FlightOptions, fly
 from endotwin.synth.lumen import Lumen
 from endotwin.twin import Twin
@@ -22,13 +21,20 @@ from endotwin.twin import Twin
 TILE = (720, 540)
 """Size in pixels, width and height, of one view in a contact sheet; a window is twice as large."""
 
-KEYS = "m, space: next map   o: outside   i: inside   c: camera path   q: quit"
+OFF_SCREEN_WINDOWS = ("vtkEGLRenderWindow", "vtkOSOpenGLRenderWindow")
+
+KEYS = "m, space: next map   o: outside   i: inside   c: camera path   k: save keyframe   q: quit"
+FRUSTA = 8
+LEAP = 10.0
+"""Where a step between poses is this many times the usual one, they are drawn as points and not as a path."""
+
 BACKGROUND, INK, UNSEEN, PATH = "#14161a", "#e8e8e8", "#555b66", "#ffb000"
 CAPTION_OPACITY = 0.7
+MARGIN_PX = 12
 DISPLAY_GAMMA = 2.2
 SHADING = {"ambient": 0.7, "diffuse": 0.3, "smooth_shading": True}
 BAR = {"color": INK, "vertical": False, "n_labels": 2}
-BAR |= {"position_x": 0.5, "position_y": 0.08, "width": 0.47, "height": 0.12, "unconstrained_font_size": True}
+BAR |= {"position_x": 0.5, "position_y": 0.86, "width": 0.47, "height": 0.12, "unconstrained_font_size": True}
 BAR |= {"title_font_size": 18, "label_font_size": 16}
 
 
@@ -68,7 +74,11 @@ def twin_maps(twin: Twin) -> dict[str, Map]:
 
 
 def inspect(
-    twin: Twin, screenshot: Path | str | None = None, map: str | None = None, overwrite: bool = False
+    twin: Twin,
+    screenshot: Path | str | None = None,
+    map: str | None = None,
+    overwrite: bool = False,
+    keyframes: Path | str = "keyframes.txt",
 ) -> None:
     """Open a window on ``twin``, or write a contact sheet of its maps without a display.
 
@@ -77,6 +87,7 @@ def inspect(
         map: ``base_color``, ``roughness``, ``metallic``, ``coverage`` or ``normals``: the window's first, the
             sheet's only one. All maps unless given.
         overwrite: whether ``screenshot`` may exist.
+        keyframes: pose file that the key k adds the window's view to, for the trajectory ``spline:FILE``.
 
     Raises:
         OptionError: the twin has no such map, or there is no display to open a window on.
@@ -89,23 +100,24 @@ def inspect(
     if screenshot is None:
         if not _has_display():
             raise OptionError(
-                "there is no display to open a window on; write a picture with --screenshot FILE"
+                "there is no display to open a window on; write a picture with --screenshot FILE.png"
             )
-        _Stage(twin, maps, off_screen=False).open_window(map or next(iter(maps)))
+        Stage(twin, maps, off_screen=False).open_window(map or next(iter(maps)), Path(keyframes))
         return
-    check_free(Path(screenshot), overwrite)
-    if Path(screenshot).suffix.lower() != ".png":
-        raise OptionError(f"{screenshot} is not the name of a PNG picture; let it end in .png")
-    vtkLogger.SetStderrVerbosity(vtkLogger.VERBOSITY_ERROR)  # it warns of the display that is not needed
-    sheet = _Stage(twin, maps, off_screen=True).contact_sheet([map] if map else list(maps))
+    check_picture(Path(screenshot), overwrite)
+    sheet = Stage(twin, maps, off_screen=True).contact_sheet([map] if map else list(maps))
     with whole_file(Path(screenshot), overwrite) as beside:
         if not cv2.imwrite(str(beside), sheet[..., ::-1]):
             raise OutputError(f"{screenshot} cannot be written; is the disk full?")
 
 
 def _has_display() -> bool:
-    named = os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
-    return bool(named) or not sys.platform.startswith("linux")
+    """Whether VTK can open a window; where no display answers, its windows are off-screen ones."""
+    vtkLogger.SetStderrVerbosity(vtkLogger.VERBOSITY_ERROR)
+    plotter = pv.Plotter(off_screen=False)
+    kind = plotter.render_window.GetClassName()
+    plotter.close()
+    return kind not in OFF_SCREEN_WINDOWS
 
 
 def _rgb(values: np.ndarray) -> np.ndarray:
@@ -119,17 +131,31 @@ def _limits(values: np.ndarray) -> tuple[float, float]:
     return float(max(middle - half, 0)), float(min(max(middle, half) + half, 1.0))
 
 
-class _Stage:
+class Stage:
     """One plotter with the mesh, the camera path and the labels.
 
     The wall that turns its back is not drawn: from outside one looks into the tube, as into a doll's house.
+
+    Args:
+        poses: [N, 4, 4] to draw; those of the twin's sequence unless given. frusta: how many of them to draw.
+        tile: size of a picture without a window, width and height.
     """
 
-    def __init__(self, twin: Twin, maps: dict[str, Map], off_screen: bool):
+    def __init__(
+        self,
+        twin: Twin,
+        maps: dict[str, Map],
+        off_screen: bool,
+        poses: np.ndarray | None = None,
+        frusta: int = FRUSTA,
+        tile: tuple[int, int] | None = None,
+    ):
+        if off_screen:  # VTK warns of the display that is not needed
+            vtkLogger.SetStderrVerbosity(vtkLogger.VERBOSITY_ERROR)
         self._maps, self._camera = maps, twin.camera
-        self._poses, self._note = _recorded_poses(twin)
-        self._inside = _viewpoint(twin, self._poses)
-        size = TILE if off_screen else (2 * TILE[0], 2 * TILE[1])
+        self._poses, self._note = _recorded_poses(twin) if poses is None else (poses, "")
+        self._frusta, self._inside = frusta, _viewpoint(twin, self._poses)
+        size = tile or TILE if off_screen else (2 * TILE[0], 2 * TILE[1])
         self._plotter = pv.Plotter(off_screen=off_screen, window_size=list(size))
         self._plotter.set_background(BACKGROUND)
         self._plotter.enable_anti_aliasing("ssaa")
@@ -186,8 +212,32 @@ class _Stage:
         self._plotter.camera.clipping_range = (0.1, 1000.0)
         self._show_path(False)
 
-    def open_window(self, name: str) -> None:
-        """Show the window until it is closed."""
+    def view_pose(self) -> np.ndarray:
+        """The pose [4, 4] of the plotter's view: camera to world, mm, OpenCV axes."""
+        camera = self._plotter.camera
+        ahead = np.subtract(camera.focal_point, camera.position)
+        ahead /= np.linalg.norm(ahead)
+        right = np.cross(ahead, camera.up)
+        right /= np.linalg.norm(right)
+        pose = np.eye(4)
+        pose[:3] = np.stack([right, np.cross(ahead, right), ahead, camera.position], axis=1)
+        return pose
+
+    def save_keyframe(self, path: Path) -> int:
+        """Add the view to the poses in the file ``path``; the number of poses that it has then.
+
+        Raises:
+            TrajectoryError: the file exists and is no pose file.
+        """
+        poses = self.view_pose()[None]
+        if path.exists():
+            poses = np.concatenate([read_poses(path)[0], poses])
+        with whole_file(path, overwrite=True) as beside:
+            write_c3vd_poses(beside, poses)
+        return len(poses)
+
+    def open_window(self, name: str, keyframes: Path) -> None:
+        """Show the window until it is closed; the key k adds its view to the pose file ``keyframes``."""
         plotter, names = self._plotter, list(self._maps)
 
         def next_map() -> None:
@@ -198,6 +248,15 @@ class _Stage:
             action()
             plotter.render()
 
+        def keep_view() -> None:
+            try:
+                done = f"keyframe {self.save_keyframe(keyframes)} saved to {keyframes}"
+            except (EndotwinError, OSError) as error:
+                done = f"no keyframe saved: {error}"
+            self._caption(done, "keyframe", (12, 42), 9)
+            plotter.render()
+
+        plotter.add_key_event("k", keep_view)
         for key in ("m", "space"):
             plotter.add_key_event(key, next_map)
         plotter.add_key_event("o", lambda: rendered(self.look_from_outside))
@@ -210,9 +269,14 @@ class _Stage:
         self.look_from_outside()
         plotter.show(title="endotwin")
 
-    def contact_sheet(self, names: list[str]) -> np.ndarray:
-        """Uint8 [H, W, 3]: a column a map, outside above inside."""
-        looks = [self.look_from_outside] + ([self.look_from_inside] if self._inside is not None else [])
+    def contact_sheet(self, names: list[str], inside: bool = True) -> np.ndarray:
+        """Uint8 [H, W, 3]: a column a map, outside above ``inside``, where there is a viewpoint.
+
+        The legend stands beside the view from outside only: that from inside fills its tile.
+        """
+        looks = [self.look_from_outside]
+        if inside and self._inside is not None:
+            looks.append(self.look_from_inside)
         if self._note:
             self._caption(self._note, "note", (12, self._plotter.window_size[1] - 66), 9)
         columns = []
@@ -221,22 +285,31 @@ class _Stage:
             tiles = []
             for look in looks:
                 look()
+                for bar in self._plotter.scalar_bars.values():
+                    bar.SetVisibility(look == self.look_from_outside)
                 self._plotter.render()
                 tiles.append(self._plotter.screenshot(return_img=True))
-            columns.append(np.vstack(tiles))
+            columns.append(tiles)
         self._plotter.close()
-        return np.hstack(columns)
+        outside, *rest = (np.hstack(row) for row in zip(*columns, strict=True))
+        return np.vstack([_without_blank_rows(outside), *rest])
 
     def _draw_path(self, surface_size_mm: float) -> list[pv.Actor]:
         if self._poses is None:
             return []
         actors = []
-        if len(self._poses) > 1:
+        steps_mm = np.linalg.norm(np.diff(self._poses[:, :3, 3], axis=0), axis=1)
+        if len(self._poses) > 1 and steps_mm.max() > LEAP * max(float(np.median(steps_mm)), 1e-3):
+            places = pv.PolyData(self._poses[:, :3, 3])
+            actors.append(
+                self._plotter.add_mesh(places, color=PATH, point_size=4, lighting=False, reset_camera=False)
+            )
+        elif len(self._poses) > 1:
             line = pv.lines_from_points(self._poses[:, :3, 3])
             actors.append(
                 self._plotter.add_mesh(line, color=PATH, line_width=3, lighting=False, reset_camera=False)
             )
-        shown = self._poses[:: max(len(self._poses) // 8, 1)]
+        shown = self._poses[:: max(len(self._poses) // self._frusta, 1)]
         frusta = pv.merge([_frustum(self._camera, pose, 0.05 * surface_size_mm) for pose in shown])
         actors.append(
             self._plotter.add_mesh(frusta, color=PATH, line_width=1.5, lighting=False, reset_camera=False)
@@ -250,6 +323,12 @@ class _Stage:
     def _show_path(self, visible: bool) -> None:
         for actor in self._path:
             actor.visibility = visible
+
+
+def _without_blank_rows(picture: np.ndarray) -> np.ndarray:
+    """The picture [H, W, 3] less the rows that are further than a margin from anything drawn."""
+    drawn = (picture != pv.Color(BACKGROUND).int_rgb).any(axis=(1, 2))
+    return picture[np.convolve(drawn, np.ones(2 * MARGIN_PX + 1), "same") > 0]
 
 
 def _look(shown: Map) -> dict:

@@ -19,7 +19,7 @@ LIGHT = Light(L0=40.0, n=2.0, q=1.9)
         ("roughness + 0.05", "roughness", [0.05, 0.25, 0.55, 0.95]),
         ("roughness-0.3", "roughness", [0.0, 0.0, 0.2, 0.6]),
         ("metallic=0.1", "metallic", [0.1, 0.1, 0.1, 0.1]),
-        ("metallic=-1", "metallic", [0.0, 0.0, 0.0, 0.0]),
+        ("metallic-2", "metallic", [0.0, 0.0, 0.0, 0.0]),
         ("base_color*1e1", "base_color", [[0, 0, 0], [1, 1, 0.5], [1, 1, 1], [1, 1, 1]]),
     ],
 )
@@ -73,6 +73,19 @@ def test_an_edit_reads_back_from_how_it_prints(text):
 def test_a_material_edit_that_is_not_understood_is_refused_with_what_is_allowed(text):
     with pytest.raises(OptionError, match=r"base_color, roughness, metallic"):
         parse_material_edit(text)
+
+
+@pytest.mark.parametrize("text", ["roughness*-1", "base_color=-0.1", "metallic=1.01", "base_color.r*-2"])
+def test_a_material_that_cannot_be_is_refused(text):
+    with pytest.raises(OptionError, match=r"cannot be negative|between 0 and 1"):
+        parse_material_edit(text)
+
+
+def test_a_light_that_cannot_be_is_refused_and_an_offset_may_be_negative():
+    for text in ("intensity=-5", "n*-1", "color.r=-1"):
+        with pytest.raises(OptionError, match="cannot be negative"):
+            parse_light_edit(text)
+    assert parse_light_edit("offset.x=-2").number == -2
 
 
 @pytest.mark.parametrize("text", ["roughness*2", "L0*2", "gamma*2", "intensity*-inf", "n"])

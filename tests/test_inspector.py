@@ -1,12 +1,15 @@
 """The inspector's pictures: all maps, from outside and inside, with and without the sequence."""
 
+import sys
+
 import cv2
 import numpy as np
 import pytest
 import tube_twin
 
 from endotwin import inspector
-from endotwin.errors import OptionError, OutputError
+from endotwin.errors import OptionError, OutputError, TrajectoryError
+from endotwin.poses import read_poses
 from endotwin.synth import synthesize
 from endotwin.synth.trajectories import Trajectory
 
@@ -25,20 +28,21 @@ def twin():
 
 
 def tiles(path, columns):
-    """Float [rows, columns, H, W, 3]: the views of a contact sheet."""
+    """Views of a sheet from outside, float [columns, h, W, 3] with h ≤ H, and inside, [columns, H, W, 3]."""
     sheet = cv2.imread(str(path)).astype(float)
-    assert sheet.shape == (2 * HEIGHT, columns * WIDTH, 3)
-    return sheet.reshape(2, HEIGHT, columns, WIDTH, 3).swapaxes(1, 2)
+    assert HEIGHT < sheet.shape[0] <= 2 * HEIGHT and sheet.shape[1:] == (columns * WIDTH, 3)
+    rows = sheet[:-HEIGHT], sheet[-HEIGHT:]
+    return [row.reshape(len(row), columns, WIDTH, 3).swapaxes(0, 1) for row in rows]
 
 
 def test_the_sheet_shows_every_map_from_outside_and_inside(twin, tmp_path):
     inspector.inspect(twin, tmp_path / "sheet.png")
-    views = tiles(tmp_path / "sheet.png", len(MAPS))
-    background = cv2.imread(str(tmp_path / "sheet.png"))[HEIGHT - 1, 0].astype(float)
-    drawn = (np.abs(views - background).max(axis=-1) > 12).mean(axis=(2, 3))
+    outside, inside = tiles(tmp_path / "sheet.png", len(MAPS))
+    background = outside[0, -1, 0]
+    drawn = [(np.abs(row - background).max(axis=-1) > 12).mean(axis=(1, 2)) for row in (outside, inside)]
     assert np.all(drawn[0] > 0.05) and np.all(drawn[0] < 0.8)
     assert np.all(drawn[1] > drawn[0])
-    for row in views:
+    for row in (outside, inside):
         for one in range(len(MAPS)):
             for other in range(one):
                 assert np.abs(row[one] - row[other]).mean() > 1, (MAPS[one], MAPS[other])
@@ -46,7 +50,7 @@ def test_the_sheet_shows_every_map_from_outside_and_inside(twin, tmp_path):
 
 def test_base_colour_is_drawn_unlit_as_it_is_displayed(twin, tmp_path):
     inspector.inspect(twin, tmp_path / "sheet.png", map="base_color")
-    inside = tiles(tmp_path / "sheet.png", 1)[1, 0, 100:, :, ::-1].reshape(-1, 3)
+    inside = tiles(tmp_path / "sheet.png", 1)[1][0, 100:, :, ::-1].reshape(-1, 3)
     materials = 255 * twin.materials.base_color ** (1 / 2.2)
     wall = inside[np.all(np.abs(inside - np.median(inside, axis=0)) < 80, axis=1)]
     assert len(wall) > 0.6 * len(inside)
@@ -57,7 +61,7 @@ def test_base_colour_is_drawn_unlit_as_it_is_displayed(twin, tmp_path):
 def test_an_unfitted_twin_shows_coverage_and_normals_only(twin, tmp_path):
     unfitted = tube_twin.unfitted(twin)
     inspector.inspect(unfitted, tmp_path / "sheet.png")
-    assert tiles(tmp_path / "sheet.png", 2).std() > 10
+    assert tiles(tmp_path / "sheet.png", 2)[0].std() > 10
     with pytest.raises(OptionError, match=r"not fitted.*coverage, normals"):
         inspector.inspect(unfitted, tmp_path / "roughness.png", map="roughness")
 
@@ -69,7 +73,7 @@ def test_the_camera_path_is_drawn_where_the_sequence_is(twin, tmp_path):
     for name, source in (("with", tmp_path / "sequence"), ("without", tmp_path / "nowhere")):
         shown = tube_twin.fitted(twin.surface, source)
         inspector.inspect(shown, tmp_path / f"{name}.png", map="base_color")
-        outside = tiles(tmp_path / f"{name}.png", 1)[0, 0]
+        outside = tiles(tmp_path / f"{name}.png", 1)[0][0]
         orange[name] = (np.abs(outside - (0, 176, 255)).max(axis=-1) < 12).sum()
     assert orange["with"] > 50 and orange["without"] == 0
 
@@ -77,7 +81,7 @@ def test_the_camera_path_is_drawn_where_the_sequence_is(twin, tmp_path):
 def test_a_picture_that_cannot_be_made_is_refused_and_nothing_is_left(twin, tmp_path):
     with pytest.raises(OptionError, match="base_color, roughness, metallic, coverage, normals"):
         inspector.inspect(twin, tmp_path / "new.png", map="temperature")
-    with pytest.raises(OptionError, match=r"\.png"):
+    with pytest.raises(OutputError, match=r"\.png"):
         inspector.inspect(twin, tmp_path / "new.jpg")
     (tmp_path / "taken.png").write_text("precious")
     with pytest.raises(OutputError, match="--overwrite"):
@@ -86,9 +90,28 @@ def test_a_picture_that_cannot_be_made_is_refused_and_nothing_is_left(twin, tmp_
     assert [file.name for file in tmp_path.iterdir()] == ["taken.png"]
 
 
-def test_without_a_display_the_window_says_what_to_do(twin, monkeypatch):
-    monkeypatch.setattr(inspector.sys, "platform", "linux")
-    monkeypatch.delenv("DISPLAY", raising=False)
-    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="X and Wayland are Linux's displays")
+@pytest.mark.parametrize("display", [None, ":99"])
+def test_without_a_display_that_answers_the_window_says_what_to_do(twin, monkeypatch, display):
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    if display:
+        monkeypatch.setenv("DISPLAY", display)
     with pytest.raises(OptionError, match="--screenshot"):
         inspector.inspect(twin)
+
+
+def test_a_saved_keyframe_is_the_view_and_keyframes_add_up(twin, tmp_path):
+    stage = inspector.Stage(twin, inspector.twin_maps(twin), off_screen=True)
+    pose = tube_twin.pose(0.4)
+    stage._plotter.camera_position = [pose[:3, 3], pose[:3, 3] + 5 * pose[:3, 2], -pose[:3, 1]]
+    np.testing.assert_allclose(stage.view_pose(), pose, atol=1e-9)
+    assert stage.save_keyframe(tmp_path / "keys.txt") == 1
+    stage.look_from_outside()
+    assert stage.save_keyframe(tmp_path / "keys.txt") == 2
+    poses, _ = read_poses(tmp_path / "keys.txt")
+    np.testing.assert_allclose(poses[0], pose, atol=1e-9)
+    (tmp_path / "other.txt").write_text("precious")
+    with pytest.raises(TrajectoryError, match="other"):
+        stage.save_keyframe(tmp_path / "other.txt")
+    assert (tmp_path / "other.txt").read_text() == "precious"

@@ -1,6 +1,7 @@
 """Rendered datasets: what is written is what was rendered, reads back, repeats its bytes, and is whole."""
 
 import json
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -11,9 +12,16 @@ import tube_twin
 from endotwin.errors import OutputError, TwinError
 from endotwin.readers import open_sequence
 from endotwin.render import Renderer
-from endotwin.synth import dataset, parse_light_edit, parse_material_edit, synthesize
-from endotwin.synth.layout import encode_depth
-from endotwin.synth.trajectories import Trajectory
+from endotwin.synth import (
+    DEFAULT_LABELS,
+    Trajectory,
+    fixed,
+    parse_light_edit,
+    parse_material_edit,
+    synthesize,
+)
+from endotwin.synth.encodings import encode_depth
+from endotwin.synth.job import fingerprint
 
 QUANTUM_MM = 100 / 65535
 
@@ -100,12 +108,12 @@ def test_the_mask_tells_photographed_from_unseen_surface_and_from_none(trajector
 
 
 def test_the_same_command_gives_the_same_bytes(twin, trajectory, written, tmp_path):
-    edits = {"material_edits": [parse_material_edit("roughness*1.1")]}
+    edited = fixed([parse_material_edit("roughness*1.1")])
     synthesize(twin, trajectory, tmp_path / "again", seed=5)
-    synthesize(twin, trajectory, tmp_path / "edited", seed=5, **edits)
+    synthesize(twin, trajectory, tmp_path / "edited", seed=5, variation=edited)
     names = sorted(file.name for file in written[0].iterdir())
     assert names == sorted(file.name for file in (tmp_path / "again").iterdir())
-    assert len(names) == 4 * 4 + 4
+    assert len(names) == 4 * 4 + 6
     for name in names:
         assert (tmp_path / "again" / name).read_bytes() == (written[0] / name).read_bytes(), name
     assert (tmp_path / "edited" / "0000_color.png").read_bytes() != (
@@ -117,7 +125,9 @@ def test_the_same_command_gives_the_same_bytes(twin, trajectory, written, tmp_pa
 
 
 def test_a_quarter_of_the_intensity_gives_the_response_of_a_quarter(twin, trajectory, written, tmp_path):
-    synthesize(twin, trajectory, tmp_path / "dim", light_edits=[parse_light_edit("intensity*0.25")])
+    synthesize(
+        twin, trajectory, tmp_path / "dim", variation=fixed(light=[parse_light_edit("intensity*0.25")])
+    )
     bright = cv2.imread(str(written[0] / "0001_color.png")).astype(float)
     dim = cv2.imread(str(tmp_path / "dim" / "0001_color.png")).astype(float)
     clear = (bright > 60) & (bright < 250)
@@ -126,18 +136,26 @@ def test_a_quarter_of_the_intensity_gives_the_response_of_a_quarter(twin, trajec
 
 
 def test_dataset_json_tells_what_was_done_and_no_path(twin, trajectory, tmp_path):
-    edits = {
-        "material_edits": [parse_material_edit("metallic=0.1")],
-        "light_edits": [parse_light_edit("n*2")],
-    }
-    synthesize(twin, trajectory, tmp_path / "dataset", seed=9, **edits)
+    edits = fixed([parse_material_edit("metallic=0.1")], [parse_light_edit("n*2")])
+    synthesize(twin, trajectory, tmp_path / "dataset", seed=9, variation=edits)
     text = (tmp_path / "dataset" / "dataset.json").read_text()
     document = json.loads(text)
     assert document["frames"] == 4 and document["seed"] == 9 and document["trajectory"] == "four poses"
-    assert document["material_edits"] == ["metallic=0.1"] and document["light"]["n"] == 4.0
-    assert document["twin"]["sha256"] == dataset.fingerprint(twin)
+    assert document["variation"]["material"] == ["metallic=0.1"]
+    assert document["variation"]["light"] == ["n*2.0"]
+    assert document["labels"] == list(DEFAULT_LABELS) and set(DEFAULT_LABELS) <= set(document["conventions"])
+    assert document["twin"]["sha256"] == fingerprint(twin) and "licence" in document["license_note"]
+    assert 0 < document["coverage"]["valid"] <= 1
     assert str(tmp_path) not in text
-    assert dataset.fingerprint(dataset.edit_twin(twin, **edits)) != dataset.fingerprint(twin)
+    edited, _ = edits.draw(1, 0)[0].edited(twin)
+    assert fingerprint(edited) != fingerprint(twin)
+
+
+def test_the_datasheet_is_one_page_that_needs_no_other_file(written):
+    page = (written[0] / "datasheet.html").read_text()
+    assert page.count("data:image/jpeg;base64,") == 4
+    assert "<svg" in page and "Coverage" in page and "licence" in page
+    assert "http" not in page and 'src="/' not in page
 
 
 def test_depth_is_rounded_clipped_at_100_mm_and_0_where_there_is_none():
@@ -145,18 +163,10 @@ def test_depth_is_rounded_clipped_at_100_mm_and_0_where_there_is_none():
     np.testing.assert_array_equal(encode_depth(depth_mm), [[0, 1, 32768, 65535, 65535, 0, 0, 65535]])
 
 
-def test_progress_counts_every_frame(twin, trajectory, tmp_path):
+def test_progress_ends_at_the_number_of_frames(twin, trajectory, tmp_path):
     calls = []
     synthesize(twin, trajectory, tmp_path / "dataset", progress=lambda *call: calls.append(call))
-    assert [call[1:] for call in calls] == [(1, 4), (2, 4), (3, 4), (4, 4)]
-
-
-def test_few_frames_are_under_way_at_a_time():
-    started = []
-    frames = dataset._each(lambda index: started.append(index) or float(index), 50)
-    for done, value in enumerate(frames):
-        assert value == done
-        assert len(started) <= done + 1 + dataset.WORKERS + 1
+    assert calls[-1] == ("render", 4, 4)
 
 
 def test_an_unfitted_twin_and_a_taken_name_are_refused_and_nothing_is_left(twin, trajectory, tmp_path):
@@ -164,21 +174,40 @@ def test_an_unfitted_twin_and_a_taken_name_are_refused_and_nothing_is_left(twin,
         synthesize(tube_twin.unfitted(twin), trajectory, tmp_path / "new")
     (tmp_path / "taken").mkdir()
     (tmp_path / "taken" / "mine").write_text("precious")
+    for overwrite in (False, True):
+        with pytest.raises(OutputError, match=r"no dataset\.json"):
+            synthesize(twin, trajectory, tmp_path / "taken", overwrite=overwrite)
+    assert sorted(file.name for file in tmp_path.rglob("*")) == ["mine", "taken"]
+
+
+def test_a_dataset_is_replaced_only_where_that_is_asked_for(twin, trajectory, tmp_path):
+    synthesize(twin, trajectory, tmp_path / "taken", labels=("rgb",))
     with pytest.raises(OutputError, match="--overwrite"):
         synthesize(twin, trajectory, tmp_path / "taken")
-    assert sorted(file.name for file in tmp_path.rglob("*")) == ["mine", "taken"]
+    assert not (tmp_path / "taken" / "0000_depth.tiff").exists()
     synthesize(twin, trajectory, tmp_path / "taken", overwrite=True)
     assert len(open_sequence(tmp_path / "taken")) == 4
-    assert not (tmp_path / "taken" / "mine").exists()
+    assert list(tmp_path.iterdir()) == [tmp_path / "taken"]
 
 
-def test_a_run_that_fails_midway_leaves_nothing(twin, trajectory, tmp_path, monkeypatch):
-    def full_disk(folder, index, labels):
-        if index == 2:
-            raise OutputError("the disk is full")
-        (folder / f"{index}").write_text("frame")
+def test_a_dataset_never_replaces_the_sequence_of_its_twin(twin, trajectory, tmp_path):
+    synthesize(twin, trajectory, tmp_path / "taken")
+    source = replace(twin.source, path=str(tmp_path / "taken"))
+    with pytest.raises(OutputError, match="is read from it"):
+        synthesize(replace(twin, source=source), trajectory, tmp_path / "taken", seed=1, overwrite=True)
+    assert len(open_sequence(tmp_path / "taken")) == 4
 
-    monkeypatch.setattr(dataset, "write_frame", full_disk)
-    with pytest.raises(OutputError, match="disk"):
-        synthesize(twin, trajectory, tmp_path / "dataset")
-    assert list(tmp_path.iterdir()) == []
+
+@pytest.mark.parametrize(("L0", "word"), [(1e-6, "black"), (1e6, "saturated")])
+def test_a_dataset_that_shows_nothing_gives_a_warning(twin, trajectory, tmp_path, caplog, L0, word):
+    synthesize(
+        replace(twin, light=replace(twin.light, L0=L0)), trajectory, tmp_path / "new", labels=("rgb", "mask")
+    )
+    assert word in caplog.text
+
+
+def test_nothing_is_written_that_was_not_asked_for(twin, trajectory, tmp_path):
+    summary = synthesize(twin, trajectory, tmp_path / "depth", labels=("depth",))
+    images = [file.name for file in (tmp_path / "depth").iterdir() if file.suffix in (".png", ".tiff")]
+    assert sorted(images) == [f"{index:04d}_depth.tiff" for index in range(4)]
+    assert summary.valid is None

@@ -1,15 +1,31 @@
-"""Rendered datasets: trajectories through a twin, edits of its materials and light, and labelled frames."""
+"""Rendered datasets: trajectories through a twin, variation of it, and labelled frames."""
 
-from endotwin.synth.dataset import Summary, synthesize
+from endotwin.synth.dataset import Summary, make_job, render_dataset, synthesize
 from endotwin.synth.edits import Edit, parse_light_edit, parse_material_edit
+from endotwin.synth.job import Job
+from endotwin.synth.labels import DEFAULT_LABELS, LABELS, parse_labels
+from endotwin.synth.layouts import LAYOUTS
+from endotwin.synth.screening import Limits
 from endotwin.synth.trajectories import Trajectory, parse_trajectory
+from endotwin.synth.variation import Variation, fixed, read_variation
 
 __all__ = [
+    "DEFAULT_LABELS",
+    "LABELS",
+    "LAYOUTS",
     "Edit",
+    "Job",
+    "Limits",
     "Summary",
     "Trajectory",
+    "Variation",
+    "fixed",
+    "make_job",
+    "parse_labels",
     "parse_light_edit",
     "parse_material_edit",
     "parse_trajectory",
+    "read_variation",
+    "render_dataset",
     "synthesize",
 ]

@@ -1,39 +1,40 @@
-"""A twin and a trajectory become a labelled dataset, which every reader of C3VD reads."""
+"""A twin and a trajectory become a labelled dataset: in shards, by any number of workers, resumable."""
 
 from __future__ import annotations
 
-import hashlib
+import errno
 import json
-from collections import deque
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+import logging
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, fields, replace
-from importlib.metadata import version
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import torch
-from threadpoolctl import threadpool_limits
+import trimesh
 
-from endotwin.output import check_free, whole_folder
-from endotwin.poses import write_c3vd_poses
-from endotwin.render import Renderer, View
-from endotwin.surface import Surface
-from endotwin.synth.edits import Edit, edit_light, edit_materials
-from endotwin.synth.layout import (
-    CONVENTIONS,
-    MASK_NONE,
-    MASK_UNSEEN,
-    MASK_VALID,
-    Labels,
-    write_frame,
-)
+from endotwin.cameras import Camera
+from endotwin.errors import EndotwinError, OptionError, OutputError, TwinError
+from endotwin.output import check_apart
+from endotwin.synth import crew
+from endotwin.synth.datasheet import write_datasheet
+from endotwin.synth.job import Job
+from endotwin.synth.labels import DEFAULT_LABELS, LABELS
+from endotwin.synth.layouts import LAYOUTS
+from endotwin.synth.partial import Partial
+from endotwin.synth.record import describe
+from endotwin.synth.shard import done_shards, frame_record, total
 from endotwin.synth.trajectories import Trajectory
+from endotwin.synth.variation import Variation
 from endotwin.twin import Twin
 
-WORKERS = 2
-LIBRARIES = ("endotwin", "numpy", "torch", "embreex", "opencv-contrib-python-headless")
+WORTH_PROCESSES = 2e7
+"""Pixels, of all frames, below which starting processes takes longer than it saves: 65 VGA frames."""
+
+EXTREME = 0.95
+"""Share of black or saturated pixels from which a dataset shows nothing."""
+
+logger = logging.getLogger("endotwin")
 
 
 @dataclass(frozen=True)
@@ -42,17 +43,20 @@ class Summary:
 
     Attributes:
         path: the dataset's folder. frames: how many. bytes: size of all of its files.
-        valid: share of the pixels that show surface which the training photos show, over all frames.
+        valid: share of the pixels that show surface which the training photos show, over all frames; None
+        where
+            no mask was asked for.
     """
 
     path: Path
     frames: int
     bytes: int
-    valid: float
+    valid: float | None
 
     def __str__(self) -> str:
         size = f"{self.bytes / 1e6:.1f} MB"
-        return f"{self.path}: {self.frames} frames, {size}, {self.valid:.1%} of the pixels valid"
+        valid = "" if self.valid is None else f", {self.valid:.1%} of the pixels valid"
+        return f"{self.path}: {self.frames} frames, {size}{valid}"
 
 
 def synthesize(
@@ -61,144 +65,176 @@ def synthesize(
     out: Path | str,
     *,
     seed: int = 0,
-    material_edits: Sequence[Edit] = (),
-    light_edits: Sequence[Edit] = (),
+    labels: tuple[str, ...] = DEFAULT_LABELS,
+    layout: str = "c3vd",
+    camera: Camera | None = None,
+    variation: Variation | None = None,
+    workers: int = 1,
+    scheduler: str | None = None,
     overwrite: bool = False,
     progress: Callable[[str, int, int], None] | None = None,
 ) -> Summary:
-    """Render ``trajectory`` with the edited twin and write it in C3VD's layout, whole or not at all.
+    """Render ``trajectory`` with the varied twin.
 
-    The same twin, trajectory, edits and seed give the same bytes on the same machine.
+    The same arguments give the same bytes on the same machine, with any number of workers. A run that stops
+    leaves ``OUT.partial``, and the same call goes on there; ``out`` itself appears when it is whole.
 
     Args:
         out: folder to make; replaced if it exists and ``overwrite`` is true.
-        seed: that the trajectory was drawn with; kept in ``dataset.json``.
+        seed: of what ``variation`` draws; kept in ``dataset.json``.
+        labels: names among ``LABELS``. layout: a name among ``LAYOUTS``.
+        camera: to render through; the twin's own unless given.
+        workers: processes; 1 renders in this one. 0: as many as there are cores, where it is worth it.
+        scheduler: address of a Dask scheduler to render on, such as ``tcp://host:8786``.
         progress: called with (label, done, total).
 
     Raises:
-        TwinError: the twin is not fitted. OutputError: ``out`` exists, or cannot be written.
+        TwinError: the twin is not fitted. OptionError: a layout does not fit the camera or the labels.
+        OutputError: ``out`` exists, another job is unfinished there, or it cannot be written.
     """
-    out = Path(out)
-    check_free(out, overwrite)
-    edited = edit_twin(twin, material_edits, light_edits)
-    renderer = Renderer(edited, threads=1)
-    photographed = photographed_triangles(twin.surface)
-
-    with whole_folder(out, overwrite) as folder:
-
-        def make(index: int) -> float:
-            labels = label(renderer.view(trajectory.T_world_camera[index]), photographed)
-            write_frame(folder, index, labels)
-            return float((labels.mask == MASK_VALID).mean())
-
-        valid = []
-        for share in _each(make, len(trajectory)):
-            valid.append(share)
-            if progress:
-                progress("render", len(valid), len(trajectory))
-        _write_tables(folder, edited, trajectory)
-        document = _document(twin, edited, trajectory, seed, material_edits, light_edits)
-        (folder / "dataset.json").write_text(json.dumps(document, indent=1, ensure_ascii=False) + "\n")
-        size = sum(file.stat().st_size for file in folder.iterdir())
-    return Summary(out, len(trajectory), size, float(np.mean(valid)))
+    job = make_job(twin, trajectory, seed, labels, layout, camera or twin.camera, variation or Variation())
+    return render_dataset(job, out, workers, scheduler, overwrite, progress)
 
 
-def edit_twin(twin: Twin, material_edits: Sequence[Edit], light_edits: Sequence[Edit]) -> Twin:
-    """The fitted twin with edited materials and light; an unfitted one as it is."""
+def render_dataset(
+    job: Job,
+    out: Path | str,
+    workers: int = 1,
+    scheduler: str | None = None,
+    overwrite: bool = False,
+    progress: Callable[[str, int, int], None] | None = None,
+) -> Summary:
+    """Do a job; arguments and errors are those of ``synthesize``."""
+    check_apart(Path(out), [job.twin.source.path])
+    partial = Partial(Path(out))
+    with partial.claimed(job.digest(), overwrite) as finished:
+        if not finished:
+            with _resumable(partial):
+                _render(job, partial, workers, scheduler, progress)
+                _finish(job, partial)
+    return _summary(Path(out))
+
+
+def make_job(
+    twin: Twin,
+    trajectory: Trajectory,
+    seed: int,
+    labels: tuple[str, ...],
+    layout: str,
+    camera: Camera,
+    variation: Variation,
+) -> Job:
+    """The job of ``synthesize``'s arguments; raises TwinError or OptionError where they do not fit."""
     if not twin.fitted:
-        return twin
-    return replace(
-        twin,
-        materials=edit_materials(twin.materials, material_edits),
-        light=edit_light(twin.light, light_edits),
+        raise TwinError("the twin has no materials yet; run 'endotwin fit' on it first")
+    if layout not in LAYOUTS:
+        raise OptionError(f"there is no layout {layout!r}; choose one of {', '.join(LAYOUTS)}")
+    refusal = LAYOUTS[layout].refusal(camera, labels)
+    if refusal:
+        raise OptionError(f"layout {layout}: {refusal}")
+    return Job(
+        twin=twin,
+        camera=camera,
+        trajectory=trajectory,
+        draws=variation.draw(len(trajectory), seed),
+        regions=variation.regions,
+        labels=labels,
+        images=tuple(image for label in labels for image in LABELS[label]),
+        layout=layout,
+        shard_frames=LAYOUTS[layout].shard_frames,
+        document=describe(twin, trajectory, seed, labels, layout, camera, variation),
     )
 
 
-def photographed_triangles(surface: Surface) -> np.ndarray:
-    """Bool [F]: triangles measured, not filled in, and seen by a training frame at every corner."""
-    return ((surface.seen_by > 0) & ~surface.filled)[surface.triangles].all(axis=1)
+def _render(
+    job: Job,
+    partial: Partial,
+    workers: int,
+    scheduler: str | None,
+    progress: Callable[[str, int, int], None] | None,
+) -> None:
+    """Render the shards that are not done yet."""
+    done = done_shards(partial.path)
+    pending = [number for number in range(job.shards) if number not in done]
+    frames = sum(len(job.shard(number)) for number in done)
+    if progress and done:
+        progress("render", frames, len(job))
+    if not pending:
+        return
+    if workers == 0:
+        pixels = (len(job) - frames) * job.camera.width * job.camera.height
+        workers = crew.cores() if pixels >= WORTH_PROCESSES else 1
+    workers = min(workers, len(pending))
+    if scheduler:
+        rendered = crew.render_on_cluster(job, partial.path, pending, scheduler)
+    elif workers > 1:
+        rendered = crew.render_in_processes(job, partial.path, pending, workers)
+    else:
+        rendered = crew.render_here(job, partial.path, pending)
+    for number in rendered:
+        frames += len(job.shard(number))
+        if progress:
+            progress("render", frames, len(job))
 
 
-def label(view: View, photographed: np.ndarray) -> Labels:
-    """The labels of one view; ``photographed`` is bool [F]."""
-    kind = np.where(photographed[view.hits.triangle], np.uint8(MASK_VALID), np.uint8(MASK_UNSEEN))
-    return Labels(view.color, view.depth_mm, view.normals, view.image(kind, MASK_NONE))
+def _finish(job: Job, partial: Partial) -> None:
+    """Write what belongs to all frames, and put the dataset in its place."""
+    statistics = total(list(done_shards(partial.path).values()))
+    _doubt_exposure(statistics.brightness)
+    folder = partial.data
+    layout = LAYOUTS[job.layout]
+    layout.tables(folder, job)
+    with (folder / "frames.jsonl").open("w", encoding="utf-8") as file:
+        for index in range(len(job)):
+            file.write(json.dumps(frame_record(job, index)) + "\n")
+    if "triangles" in job.labels:
+        surface = job.twin.surface
+        points = surface.vertices_mm.astype("float64") + surface.origin_mm
+        trimesh.Trimesh(points, surface.triangles, process=False).export(folder / "surface.ply")
+    document = {**job.document, "coverage": statistics.mean_coverage()}
+    (folder / "dataset.json").write_text(json.dumps(document, indent=1, ensure_ascii=False) + "\n")
+    write_datasheet(folder / "datasheet.html", document, statistics)
+    partial.finish()
 
 
-def _each(make: Callable[[int], float], count: int) -> Iterator[float]:
-    """``make(0)``, …, ``make(count - 1)`` in order, on WORKERS threads, with few frames in memory.
+def _doubt_exposure(brightness: np.ndarray) -> None:
+    """Warn where nearly all pixels lie in the first or the last bin of their histogram."""
+    shares = brightness / max(brightness.sum(), 1)
+    for share, word, remedy in ((shares[0], "black", "more"), (shares[-1], "saturated", "less")):
+        if share > EXTREME:
+            logger.warning(
+                "%.0f %% of what shows is %s; give the light %s intensity", 100 * share, word, remedy
+            )
 
-    Frames do not depend on each other: each may be made anywhere and at any time.
-    """
-    with _one_core_a_thread(), ThreadPoolExecutor(WORKERS) as pool:
-        running = deque()
-        try:
-            for index in range(count):
-                running.append(pool.submit(make, index))
-                if len(running) > WORKERS:
-                    yield running.popleft().result()
-            while running:
-                yield running.popleft().result()
-        finally:
-            for task in running:
-                task.cancel()
+
+def _summary(out: Path) -> Summary:
+    document = json.loads((out / "dataset.json").read_text())
+    size = sum(file.stat().st_size for file in out.rglob("*") if file.is_file())
+    return Summary(out, document["frames"], size, document["coverage"].get("valid"))
 
 
 @contextmanager
-def _one_core_a_thread() -> Iterator[None]:
-    """Torch and BLAS keep to the calling thread: with threads of their own, a frame takes 4 times as long."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
+def _resumable(partial: Partial) -> Iterator[None]:
+    """Whatever ends the block: keep what is done and say so, or leave nothing where nothing is done."""
     try:
-        with threadpool_limits(1, user_api="blas"):
-            yield
-    finally:
-        torch.set_num_threads(before)
+        yield
+    except BaseException as error:
+        if not done_shards(partial.path):
+            partial.remove()
+            if isinstance(error, OSError):
+                raise _out_of_disk(error, partial, "") from error
+            raise
+        kept = f"what is done is kept in {partial.path}, and the same command goes on from there"
+        if isinstance(error, OSError):
+            raise _out_of_disk(error, partial, f"; {kept}") from error
+        if isinstance(error, EndotwinError):
+            raise type(error)(f"{error}; {kept}") from error
+        error.add_note(kept)
+        raise
 
 
-def _write_tables(folder: Path, twin: Twin, trajectory: Trajectory) -> None:
-    """Poses, timestamps and camera, in digits that read back to the same float64."""
-    write_c3vd_poses(folder / "pose.txt", trajectory.T_world_camera)
-    timestamps = "".join(f"{float(seconds)!r}\n" for seconds in trajectory.timestamps_s)
-    (folder / "timestamps.txt").write_text(timestamps)
-    (folder / "camera.json").write_text(json.dumps(twin.camera.to_dict(), indent=1) + "\n")
-
-
-def _document(
-    twin: Twin,
-    edited: Twin,
-    trajectory: Trajectory,
-    seed: int,
-    material_edits: Sequence[Edit],
-    light_edits: Sequence[Edit],
-) -> dict:
-    """The content of ``dataset.json``: nothing of it changes from one run to the next of the same command."""
-    return {
-        "format": "c3vd",
-        "frames": len(trajectory),
-        "trajectory": trajectory.description,
-        "seed": seed,
-        "material_edits": [str(edit) for edit in material_edits],
-        "light_edits": [str(edit) for edit in light_edits],
-        "light": asdict(edited.light),
-        "response": asdict(edited.response),
-        "twin": {
-            "sha256": fingerprint(twin),
-            "vertices": len(twin.surface.vertices_mm),
-            "sequence": Path(twin.source.path).name,
-            "geometry": twin.source.geometry,
-        },
-        "versions": {library: version(library) for library in LIBRARIES},
-        "conventions": CONVENTIONS,
-    }
-
-
-def fingerprint(twin: Twin) -> str:
-    """SHA-256 of all that a rendering depends on: mesh, coverage, materials, camera, light and response."""
-    digest = hashlib.sha256()
-    for part in (twin.surface, twin.camera, twin.materials, twin.light, twin.response):
-        for field in fields(part):
-            value = np.ascontiguousarray(getattr(part, field.name))
-            digest.update(f"{field.name} {value.dtype.str} {value.shape}".encode())
-            digest.update(value.tobytes())
-    return digest.hexdigest()
+def _out_of_disk(error: OSError, partial: Partial, kept: str) -> OutputError:
+    reason = (
+        "the disk is full" if error.errno in (errno.ENOSPC, errno.EDQUOT) else error.strerror or str(error)
+    )
+    return OutputError(f"{error.filename or partial.path} cannot be written: {reason}; make room{kept}")

@@ -1,4 +1,4 @@
-"""Edits of materials and light, such as ``roughness*1.3`` or ``intensity=0.8``."""
+"""Edits of materials, light and response: ``roughness*1.3``, ``base_color.r+0.1``, ``intensity=0.8``."""
 
 from __future__ import annotations
 
@@ -10,13 +10,24 @@ from math import isfinite
 import numpy as np
 
 from endotwin.errors import OptionError
-from endotwin.twin import Light, Materials
+from endotwin.twin import Light, Materials, Response
 
-MATERIALS = {"base_color": 1.0, "roughness": 1.0, "metallic": 1.0}
-"""Materials that can be edited, and the largest value of each; the least is 0."""
+CHANNELS = ("r", "g", "b")
+
+MATERIALS = ("base_color", "roughness", "metallic", *(f"base_color.{channel}" for channel in CHANNELS))
+"""Materials that can be edited, each kept within [0, 1]."""
 
 LIGHTS = {"intensity": "L0", "n": "n", "q": "q"}
-"""Lights' parameters that can be edited, and the field of Light that each one is; the least is 0."""
+"""Parameters of the light that can be edited, and the field of Light that each one is; the least is 0."""
+
+TINTS = tuple(f"color.{channel}" for channel in CHANNELS)
+"""The light's colour, a factor on each channel of the radiance, 1 unless edited; the least is 0."""
+
+OFFSETS = ("offset.x", "offset.y", "offset.z")
+"""Places of the light guides in the camera frame, mm; 0 where the light is at the lens."""
+
+RESPONSES = ("gamma", "gain")
+"""γ of the camera response, and a factor on the radiance before it, 1 unless edited; the least is 0."""
 
 OPERATIONS = {
     "*": lambda value, number: value * number,
@@ -25,7 +36,7 @@ OPERATIONS = {
     "=": lambda value, number: value * 0 + number,
 }
 
-EDIT = re.compile(r"\s*(?P<name>\w+)\s*(?P<operation>[-+*=])\s*(?P<number>\S+)\s*")
+EDIT = re.compile(r"\s*(?P<name>[\w.]+)\s*(?P<operation>[-+*=])\s*(?P<number>\S+)\s*")
 
 
 @dataclass(frozen=True)
@@ -45,45 +56,103 @@ class Edit:
 
 
 def parse_material_edit(text: str) -> Edit:
-    """An edit of ``base_color``, ``roughness`` or ``metallic``; raises OptionError for anything else."""
-    return _parse(text, "material", tuple(MATERIALS))
+    """An edit of one of ``MATERIALS``; raises OptionError for anything else."""
+    return parse_edit(text, "material", MATERIALS)
 
 
 def parse_light_edit(text: str) -> Edit:
-    """An edit of the light's ``intensity`` (L0), ``n`` or ``q``; raises OptionError for anything else."""
-    return _parse(text, "light", tuple(LIGHTS))
+    """An edit of the light's ``intensity`` (L0), ``n``, ``q``, colour or offset; raises OptionError for
+    anything else."""
+    return parse_edit(text, "light", (*LIGHTS, *TINTS, *OFFSETS))
 
 
-def edit_materials(materials: Materials, edits: Iterable[Edit]) -> Materials:
-    """The materials after ``edits``, one after the other, each value kept within [0, 1]."""
+def edit_materials(
+    materials: Materials, edits: Iterable[Edit], weight: np.ndarray | None = None
+) -> Materials:
+    """The materials after ``edits``, one after the other, each value kept within [0, 1].
+
+    Args:
+        weight: float32 [V] in [0, 1], how much of the edit each vertex takes; all of it unless given.
+    """
     for edit in edits:
-        values = edit.apply(getattr(materials, edit.name))
-        clamped = np.clip(values, 0, MATERIALS[edit.name]).astype(np.float32)
-        materials = replace(materials, **{edit.name: clamped})
+        name, _, channel = edit.name.partition(".")
+        values = getattr(materials, name)
+        edited = edit.apply(values).astype(np.float32)
+        if channel:
+            edited = np.where(np.array(CHANNELS) == channel, edited, values)
+        if weight is not None:
+            edited = values + (edited - values) * weight.reshape(-1, *[1] * (values.ndim - 1))
+        materials = replace(materials, **{name: np.clip(edited, 0, 1).astype(np.float32)})
     return materials
 
 
 def edit_light(light: Light, edits: Iterable[Edit]) -> Light:
-    """The light after ``edits``, one after the other, each value at least 0."""
+    """The light after those ``edits`` that are of its own fields, one after the other, each at least 0."""
     for edit in edits:
-        field = LIGHTS[edit.name]
-        light = replace(light, **{field: max(0.0, float(edit.apply(getattr(light, field))))})
+        if edit.name in LIGHTS:
+            field = LIGHTS[edit.name]
+            light = replace(light, **{field: max(0.0, float(edit.apply(getattr(light, field))))})
     return light
 
 
-def _parse(text: str, kind: str, names: tuple[str, ...]) -> Edit:
-    allowed = (
-        f"write NAME*NUMBER, NAME+NUMBER, NAME-NUMBER or NAME=NUMBER with NAME one of {', '.join(names)}"
-    )
-    match = EDIT.fullmatch(text)
+def edit_response(response: Response, edits: Iterable[Edit]) -> Response:
+    """The response after ``edits`` of ``gamma``, at least 0; ``gain`` is ``exposure``'s."""
+    for edit in edits:
+        if edit.name == "gamma":
+            response = replace(response, gamma=max(0.0, float(edit.apply(response.gamma))))
+    return response
+
+
+def exposure(edits: Iterable[Edit]) -> np.ndarray:
+    """The factor float32 [3] on the radiance that edits of ``gain`` and ``color.r``, ``.g``, ``.b`` make."""
+    factor = np.ones(3)
+    gain = 1.0
+    for edit in edits:
+        if edit.name == "gain":
+            gain = max(0.0, float(edit.apply(gain)))
+        elif edit.name in TINTS:
+            channel = TINTS.index(edit.name)
+            factor[channel] = max(0.0, float(edit.apply(factor[channel])))
+    return (factor * gain).astype(np.float32)
+
+
+def parse_edit(text: str, kind: str, names: tuple[str, ...]) -> Edit:
+    """The edit ``NAME*NUMBER`` (or ``+``, ``-``, ``=``), NAME one of ``names``; else raises OptionError."""
+    name, operation, number = split_edit(text, kind, names)
+    value = finite(number, text, kind, names)
+    require_possible(name, operation, value, text, kind)
+    return Edit(name, operation, value)
+
+
+def require_possible(name: str, operation: str, value: float, text: str, kind: str) -> None:
+    """Raise OptionError for a factor or a value that would make the parameter negative, or a material more
+    than 1."""
+    if operation in "*=" and value < 0 and name not in OFFSETS:
+        raise OptionError(f"{kind} edit {text!r}: {name} cannot be negative; write a number of at least 0")
+    if operation == "=" and value > 1 and name in MATERIALS:
+        raise OptionError(f"{kind} edit {text!r}: {name} lies between 0 and 1; write such a number")
+
+
+def split_edit(text: str, kind: str, names: tuple[str, ...]) -> tuple[str, str, str]:
+    """Name, operation and number of an edit, the number as it was typed; raises OptionError."""
+    match = EDIT.fullmatch(str(text))
     if match is None:
-        raise OptionError(f"{kind} edit {text!r} is not understood; {allowed}")
+        raise OptionError(f"{kind} edit {text!r} is not understood; {_allowed(names)}")
     if match["name"] not in names:
-        raise OptionError(f"{kind} edit {text!r}: there is no {match['name']!r} to edit; {allowed}")
+        raise OptionError(f"{kind} edit {text!r}: there is no {match['name']!r} to edit; {_allowed(names)}")
+    return match["name"], match["operation"], match["number"]
+
+
+def finite(number: str, text: str, kind: str, names: tuple[str, ...]) -> float:
+    """The number that was typed as part of the edit ``text``; raises OptionError unless it is finite."""
     try:
-        number = float(match["number"])
+        value = float(number)
     except ValueError:
-        number = float("nan")
-    if not isfinite(number):
-        raise OptionError(f"{kind} edit {text!r}: {match['number']!r} is not a finite number; {allowed}")
-    return Edit(match["name"], match["operation"], number)
+        value = float("nan")
+    if not isfinite(value):
+        raise OptionError(f"{kind} edit {text!r}: {number!r} is not a finite number; {_allowed(names)}")
+    return value
+
+
+def _allowed(names: tuple[str, ...]) -> str:
+    return f"write NAME*NUMBER, NAME+NUMBER, NAME-NUMBER or NAME=NUMBER with NAME one of {', '.join(names)}"

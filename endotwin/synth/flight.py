@@ -36,35 +36,32 @@ class FlightOptions:
     reverse: bool = field(default=False, metadata={"help": "true: withdrawal, backwards while looking ahead"})
 
 
-def fly(options: FlightOptions, lumen: Lumen, camera: Camera, seed: int) -> tuple[np.ndarray, str]:
+def fly(
+    options: FlightOptions, lumen: Lumen, camera: Camera, seed: int, clearance_mm: float = 1.0
+) -> tuple[np.ndarray, str]:
     """Poses ``T_world_camera`` float64 [N, 4, 4] of a flight along the lumen, and its description.
 
     The camera looks along the centreline; its up direction is carried along without twist. ``seed`` chooses
-    where the sway of ``look`` begins.
+    where the sway of ``look`` begins. It keeps to the part of the line that has ``clearance_mm`` about it.
 
     Raises:
-        TrajectoryError: there is no centreline, it is too short for ``frames`` at ``speed``, or a pose on it
-            does not lie inside the surface.
+        TrajectoryError: there is no centreline, or it is too short for ``frames`` at ``speed``.
     """
     line = _approached(find_centerline(lumen))
     ahead = unit(np.gradient(line, axis=0))
-    outlook = lumen.outlook(camera, _poses(untwisted(line, ahead), line))
-    first, last = longest_run(outlook.inside & (outlook.front >= FRONT_MIN))
+    outlook = lumen.outlook(camera, posed(untwisted(line, ahead), line))
+    clear = outlook.inside & (outlook.clearance_mm >= clearance_mm)
+    first, last = longest_run(clear & (outlook.front >= FRONT_MIN))
     if last - first < 2:
         raise TrajectoryError(
             "no place on the centreline shows enough of the wall to fly there; give a pose file or 'jitter:'"
         )
     arc = arc_length(line)
-    at_mm = arc[first] + _stops(options, arc[last - 1] - arc[first])
+    at_mm = arc[first] + stops(options.frames, options.speed, arc[last - 1] - arc[first])
     points = CubicSpline(arc, line)(at_mm)
     tangents = unit(CubicSpline(arc, ahead)(at_mm))
     rotations = untwisted(points, tangents) @ _sway(at_mm - at_mm[0], options.look, seed)
-    poses = _poses(rotations, points)
-    inside = lumen.outlook(camera, poses).inside
-    if not inside.all():
-        raise TrajectoryError(
-            f"{np.count_nonzero(~inside)} of {len(poses)} poses look past the wall; use a smaller 'look'"
-        )
+    poses = posed(rotations, points)
     length_mm = at_mm[-1] - at_mm[0]
     description = (
         f"{'withdrawal' if options.reverse else 'fly-through'} of {length_mm:.2f} mm along the centreline"
@@ -108,25 +105,31 @@ def _reflected(vector: np.ndarray, across: np.ndarray) -> np.ndarray:
     return vector if squared < 1e-24 else vector - across * (2 * (across @ vector) / squared)
 
 
-def _poses(rotations: np.ndarray, points: np.ndarray) -> np.ndarray:
+def posed(rotations: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Poses [N, 4, 4] of camera-to-world rotations [N, 3, 3] at points [N, 3]."""
     poses = np.tile(np.eye(4), (len(points), 1, 1))
     poses[:, :3, :3] = rotations
     poses[:, :3, 3] = points
     return poses
 
 
-def _stops(options: FlightOptions, length_mm: float) -> np.ndarray:
-    """Where on a line of ``length_mm`` the poses are, mm from its start, float64 [N]."""
-    if options.frames and not options.speed:
-        return np.linspace(0, length_mm, options.frames)
-    speed = options.speed or SPEED_MM
+def stops(frames: int, speed: float, length_mm: float) -> np.ndarray:
+    """Where on a path of ``length_mm`` the poses are, mm from its start, float64 [N].
+
+    ``frames`` poses ``speed`` mm apart; 0 frames: as many as fit; speed 0: even over the whole path, or
+    SPEED_MM without frames. Raises TrajectoryError where the path is too short.
+    """
+    if frames and not speed:
+        return np.linspace(0, length_mm, frames)
+    speed = speed or SPEED_MM
     fits = int(length_mm / speed * (1 + 1e-12)) + 1
-    if options.frames > fits:
+    if frames > fits:
         raise TrajectoryError(
-            f"{options.frames} frames at {speed:g} mm a frame need more than the {length_mm:.1f} mm that the "
-            f"centreline has; use at most {fits} frames or a lower speed"
+            f"{frames} frames at {speed:g} mm a frame need more than the {length_mm:.1f} mm that the path "
+            f"has; "
+            f"use at most {fits} frames or a lower speed"
         )
-    return speed * np.arange(options.frames or fits)
+    return speed * np.arange(frames or fits)
 
 
 def _sway(at_mm: np.ndarray, look_degrees: float, seed: int) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""What a pose sees of the lumen: whether it lies inside the surface, clear of the wall, looking at it."""
+"""What a pose sees of the lumen: whether it lies inside the surface and looks at it, and how near it is."""
 
 from __future__ import annotations
 
@@ -10,9 +10,6 @@ from endotwin.cameras import Camera
 from endotwin.casting import Caster
 from endotwin.incidence import unit
 from endotwin.surface import Surface
-
-CLEARANCE_MIN_MM = 1.0
-"""Least distance from the camera centre to the wall."""
 
 FRONT_MIN = 0.3
 """Least share of the view that sees the wall from the lumen."""
@@ -33,25 +30,25 @@ class Outlook:
         front: float64 [N], share of the view whose rays meet the wall on its lumen side.
         back: float64 [N], share whose rays meet it from behind.
         clearance_mm: float64 [N], distance to the nearest wall in any direction; inf where there is none.
+        unseen: float64 [N], share of the view whose surface was measured, but seen by no training photo.
+        filled: float64 [N], share of the view whose surface was filled in.
     """
 
     front: np.ndarray
     back: np.ndarray
     clearance_mm: np.ndarray
+    unseen: np.ndarray
+    filled: np.ndarray
+
+    @property
+    def empty(self) -> np.ndarray:
+        """Float64 [N], share of the view that meets no surface."""
+        return 1 - self.front - self.back
 
     @property
     def inside(self) -> np.ndarray:
-        """Bool [N]: poses that can be rendered."""
-        return (self.front >= FRONT_MIN) & (self.back <= BACK_MAX) & (self.clearance_mm >= CLEARANCE_MIN_MM)
-
-    def fault(self, index: int) -> str:
-        """What is wrong with a pose that is not ``inside``, as the end of a sentence."""
-        if self.front[index] >= FRONT_MIN and self.back[index] <= BACK_MAX:
-            return f"is {self.clearance_mm[index]:.2f} mm from the wall (least: {CLEARANCE_MIN_MM:g} mm)"
-        return (
-            f"lies outside the surface or looks away from it: {self.front[index]:.0%} of its view meets the "
-            f"lumen's wall, {self.back[index]:.0%} the wall's back"
-        )
+        """Bool [N]: poses inside the surface that look at its wall."""
+        return (self.front >= FRONT_MIN) & (self.back <= BACK_MAX) & (self.clearance_mm > 0)
 
 
 class Lumen:
@@ -63,6 +60,9 @@ class Lumen:
         a, b, c = (surface.vertices_mm[surface.triangles[:, k]] for k in range(3))
         self._facing = unit(np.cross(b - a, c - a))
         self._sphere = fibonacci_sphere(SPHERE_RAYS)
+        corners = surface.triangles
+        self._filled = surface.filled[corners].any(axis=1)
+        self._unseen = (surface.seen_by == 0)[corners].any(axis=1) & ~self._filled & surface.seen_by.any()
 
     def probe(self, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """First hits of rays in the surface's local frame.
@@ -91,12 +91,16 @@ class Lumen:
         return Outlook(*np.concatenate(seen, axis=1))
 
     def _outlook(self, camera: Camera, poses: np.ndarray) -> np.ndarray:
-        """Front, back and clearance of a batch of poses [N, 4, 4], float64 [3, N]."""
+        """The fields of Outlook for a batch of poses [N, 4, 4], float64 [5, N]."""
         origins = poses[:, :3, 3] - self.surface.origin_mm
         view = np.einsum("nij,mj->nmi", poses[:, :3, :3], view_directions(camera))
         _, triangle, front = self.probe(origins, view)
         around, _, _ = self.probe(origins, np.broadcast_to(self._sphere, (len(poses), *self._sphere.shape)))
-        return np.stack([front.mean(1), ((triangle >= 0) & ~front).mean(1), around.min(1)])
+        hit = triangle >= 0
+        unseen, filled = (hit & kind[triangle] for kind in (self._unseen, self._filled))
+        return np.stack(
+            [front.mean(1), (hit & ~front).mean(1), around.min(1), unseen.mean(1), filled.mean(1)]
+        )
 
 
 def view_directions(camera: Camera) -> np.ndarray:

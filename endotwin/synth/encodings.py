@@ -1,0 +1,182 @@
+"""How each label becomes the bytes of a file, and the words that say so."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from io import BytesIO
+
+import cv2
+import numpy as np
+import tifffile
+
+from endotwin.readers.c3vd import DEPTH_RANGE_MM
+
+FLOW_RANGE_PX = 20.0
+UINT16 = 65535
+
+# Measured on VGA frames of a fitted twin, one core:
+# PNG level 1, run lengths, filter of averages: 8 ms and 216 kB; with all filters tried: 14 ms and 207 kB.
+# Depth: Deflate of differences 15 ms, 187 kB; plain Deflate 11 ms, 487 kB; uncompressed 1 ms, 615 kB.
+# Normals: Deflate of differences 60 ms, 1.25 MB; plain Deflate 25 ms, 1.72 MB; uncompressed 1 ms, 1.84 MB.
+# LZW is no smaller, and tifffile cannot read it without further packages.
+PNG = (
+    *(cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE),
+    *(cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_AVG),
+)
+SMOOTH_TIFF = (
+    *(cv2.IMWRITE_TIFF_COMPRESSION, cv2.IMWRITE_TIFF_COMPRESSION_ADOBE_DEFLATE),
+    *(cv2.IMWRITE_TIFF_PREDICTOR, cv2.IMWRITE_TIFF_PREDICTOR_HORIZONTAL),
+)
+PLAIN_TIFF = (cv2.IMWRITE_TIFF_COMPRESSION, cv2.IMWRITE_TIFF_COMPRESSION_NONE)
+
+
+@dataclass(frozen=True)
+class Encoding:
+    """One way to write a label.
+
+    Attributes:
+        suffix: of the file's name, with its dot. encode: an image to the file's bytes, the same for the same
+            image. words: what the file holds and how to read it.
+    """
+
+    suffix: str
+    encode: Callable[[np.ndarray], bytes]
+    words: str
+
+
+def encode_color(color: np.ndarray) -> np.ndarray:
+    """Display values [...] in [0, 1] as uint8, to the nearest."""
+    return np.rint(np.clip(color, 0, 1) * np.float32(255)).astype(np.uint8)
+
+
+def encode_unit(values: np.ndarray) -> np.ndarray:
+    """Linear values [...] in [0, 1] as uint16, to the nearest; larger ones are clipped."""
+    return np.rint(np.clip(values, 0, 1) * np.float32(UINT16)).astype(np.uint16)
+
+
+def encode_depth(depth_mm: np.ndarray, levels_per_mm: float = UINT16 / DEPTH_RANGE_MM) -> np.ndarray:
+    """Z-depth [H, W] as uint16: 0 where there is none, or none in front; clipped at 65535."""
+    raw = np.rint(depth_mm * np.float32(levels_per_mm))
+    return np.clip(np.where(depth_mm > 0, np.maximum(raw, 1), 0), 0, UINT16).astype(np.uint16)
+
+
+def encode_normals(normals: np.ndarray) -> np.ndarray:
+    """Unit normals [H, W, 3] as uint16; 0 where the normal is 0, which is none."""
+    raw = normals * np.float32(UINT16 / 2)
+    raw += np.float32(UINT16 / 2 + 0.5)
+    coded = raw.astype(np.uint16)
+    coded[(normals[..., 0] == 0) & (normals[..., 1] == 0) & (normals[..., 2] == 0)] = 0
+    return coded
+
+
+def encode_flow(flow_px: np.ndarray) -> np.ndarray:
+    """Flow [H, W, 2], NaN where there is none, as C3VD's uint16 [H, W, 3]: ±20 px, 0 none or beyond."""
+    inside = (np.abs(flow_px) <= FLOW_RANGE_PX).all(axis=-1, keepdims=True)
+    raw = np.rint((np.where(inside, flow_px, 0) + FLOW_RANGE_PX) * (UINT16 / 2 / FLOW_RANGE_PX))
+    coded = np.zeros((*flow_px.shape[:2], 3), np.uint16)
+    coded[..., :2] = np.where(inside, np.maximum(raw, 1), 0)
+    return coded
+
+
+def rgb_order(image: np.ndarray) -> np.ndarray:
+    """The image as OpenCV writes it: blue first."""
+    return cv2.cvtColor(image, cv2.COLOR_RGB2BGR) if image.ndim == 3 else image
+
+
+def png(image: np.ndarray) -> bytes:
+    """A PNG file of an image uint8 or uint16, [H, W] or RGB [H, W, 3]."""
+    return cv2.imencode(".png", rgb_order(image), PNG)[1].tobytes()
+
+
+def tiff(image: np.ndarray, options: tuple[int, ...]) -> bytes:
+    """A TIFF file of an image uint16, [H, W] or RGB [H, W, 3]."""
+    return cv2.imencode(".tiff", rgb_order(image), options)[1].tobytes()
+
+
+def ids(image: np.ndarray) -> bytes:
+    """A TIFF file of int32 [H, W]."""
+    file = BytesIO()
+    tifffile.imwrite(file, image, compression="adobe_deflate", compressionargs={"level": 1}, metadata=None)
+    return file.getvalue()
+
+
+def depth_png(levels_per_mm: float, words: str) -> Encoding:
+    """16-bit PNG depth of so many levels a millimetre."""
+    return Encoding(".png", lambda depth_mm: png(encode_depth(depth_mm, levels_per_mm)), words)
+
+
+_FLOW = (
+    "R: x to the right, G: y down, raw / 65535 * 40 - 20 px (C3VD's code); 0, 0: none (no surface, no such "
+    "frame, behind its lens, or beyond 20 px); {way}: the surface point of pixel p lies at p + flow there, "
+    "seen "
+    "or hidden"
+)
+_HIDDEN = (
+    "8-bit: 255: the pixel's surface point is hidden or out of the picture in the {other} frame; 128: there "
+    "is no surface, or no such frame; 0: it is seen there"
+)
+
+ENCODINGS: dict[str, Encoding] = {
+    "rgb": Encoding(
+        ".png",
+        lambda color: png(encode_color(color)),
+        "8-bit RGB, after the camera response; black where no surface is seen",
+    ),
+    "rgb_linear": Encoding(
+        ".png",
+        lambda radiance: png(encode_unit(radiance)),
+        "16-bit RGB radiance before the camera response, linear; 65535: display white and above (clipped)",
+    ),
+    "depth": Encoding(
+        ".tiff",
+        lambda depth_mm: tiff(encode_depth(depth_mm), SMOOTH_TIFF),
+        "16-bit z-depth, raw / 65535 * 100 mm; 0: none; 65535: 100 mm up (clipped)",
+    ),
+    "normals": Encoding(
+        ".tiff",
+        lambda normals: tiff(encode_normals(normals), PLAIN_TIFF),
+        "16-bit RGB, raw / 65535 * 2 - 1 = x, y, z of the unit normal that points into the lumen, in camera "
+        "axes; 0, 0, 0: none",
+    ),
+    "albedo": Encoding(
+        ".png",
+        lambda albedo: png(encode_unit(albedo)),
+        "16-bit RGB base colour, linear, 65535: 1; black: none",
+    ),
+    "roughness": Encoding(
+        ".png", lambda values: png(encode_unit(values)), "16-bit roughness, 65535: 1; 0: none"
+    ),
+    "metallic": Encoding(".png", lambda values: png(encode_unit(values)), "16-bit metallic, 65535: 1"),
+    "diffuse": Encoding(
+        ".png",
+        lambda color: png(encode_color(color)),
+        "8-bit RGB as rgb, without specular reflection",
+    ),
+    "flow": Encoding(
+        ".tiff",
+        lambda flow_px: tiff(encode_flow(flow_px), SMOOTH_TIFF),
+        "16-bit, " + _FLOW.format(way="from this frame back to the previous one"),
+    ),
+    "flow_hidden": Encoding(".png", png, _HIDDEN.format(other="previous")),
+    "flow_forward": Encoding(
+        ".tiff",
+        lambda flow_px: tiff(encode_flow(flow_px), SMOOTH_TIFF),
+        "16-bit, " + _FLOW.format(way="from this frame on to the next one"),
+    ),
+    "flow_forward_hidden": Encoding(".png", png, _HIDDEN.format(other="next")),
+    "occlusion": Encoding(
+        ".png",
+        png,
+        "8-bit (C3VD's): 255: the surface hides other surface behind it, within 100 mm of the camera; 0: not",
+    ),
+    "mask": Encoding(
+        ".png",
+        png,
+        "8-bit: 255: surface that the training photos show; 128: measured, but shown by none of them (its "
+        "materials are a guess); 64: filled in (its shape is a guess too); 0: no surface",
+    ),
+    "triangles": Encoding(
+        ".tiff", ids, "32-bit signed: index of the triangle in surface.ply, counted from 0; -1: none"
+    ),
+}

@@ -1,0 +1,65 @@
+"""Where a surface point lies in another view, and what hides it: exact, by rays through the mesh."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from endotwin.cameras import Camera
+from endotwin.casting import Caster, Correspondences
+from endotwin.surface import Surface
+
+HIDDEN_MM = 1e-3
+HIDDEN = 1e-4
+"""A point is hidden where a ray to it ends more than HIDDEN_MM + HIDDEN·distance before it."""
+
+BEHIND_MM = 0.01
+"""How far behind a hit the ray goes on that looks for surface hidden by it."""
+
+OCCLUSION_RANGE_MM = 100.0
+
+
+def surface_points(surface: Surface, hits: Correspondences) -> np.ndarray:
+    """World points of hits, float64 [N, 3], mm."""
+    corners = surface.vertices_mm[surface.triangles[hits.triangle]].astype(np.float64)
+    return np.einsum("nk,nka->na", hits.barycentric.astype(np.float64), corners) + surface.origin_mm
+
+
+def flow_to(points: np.ndarray, pixel: np.ndarray, camera: Camera, T_world_other: np.ndarray) -> np.ndarray:
+    """Motion float64 [N, 2], px, of pixels int [N] to where their points [N, 3] lie in the view from another
+    pose [4, 4]; NaN where the lens does not see in that direction."""
+    uv = np.stack([pixel % camera.width, pixel // camera.width], axis=1)
+    return camera.project(to_camera_frame(points, T_world_other)) - uv
+
+
+def seen_from(points: np.ndarray, caster: Caster, camera: Camera, T_world_other: np.ndarray) -> np.ndarray:
+    """Bool [N]: points [N, 3] on the surface that the view from ``T_world_other`` [4, 4] shows."""
+    uv = camera.project(to_camera_frame(points, T_world_other))
+    inside = np.isfinite(uv).all(axis=1)
+    inside &= ((uv > -0.5) & (uv < (camera.width - 0.5, camera.height - 0.5))).all(axis=1)
+    chosen = np.flatnonzero(inside)
+    origin = T_world_other[:3, 3]
+    towards = points[chosen] - origin
+    distance_mm = np.linalg.norm(towards, axis=1)
+    local = (origin - caster.surface.origin_mm).astype(np.float32)
+    rays = (towards / np.maximum(distance_mm, 1e-9)[:, None]).astype(np.float32)
+    _, _, first_mm = caster.cast_rays(np.broadcast_to(local, rays.shape), rays)
+    seen = np.zeros(len(points), bool)
+    seen[chosen] = first_mm >= distance_mm * (1 - HIDDEN) - HIDDEN_MM
+    return seen
+
+
+def hides_surface(
+    points: np.ndarray, hits: Correspondences, caster: Caster, T_world_camera: np.ndarray
+) -> np.ndarray:
+    """Bool [N]: points [N, 3] of ``hits`` with more surface behind them on the same ray, within
+    OCCLUSION_RANGE_MM of the camera (C3VD's occlusion)."""
+    towards = points - T_world_camera[:3, 3]
+    rays = (towards / np.linalg.norm(towards, axis=1, keepdims=True)).astype(np.float32)
+    behind = (points - caster.surface.origin_mm).astype(np.float32) + BEHIND_MM * rays
+    _, _, further_mm = caster.cast_rays(behind, rays)
+    return hits.distance_mm + BEHIND_MM + further_mm <= OCCLUSION_RANGE_MM
+
+
+def to_camera_frame(points: np.ndarray, T_world_camera: np.ndarray) -> np.ndarray:
+    """World points [N, 3] in the frame of the camera at ``T_world_camera`` [4, 4]."""
+    return (points - T_world_camera[:3, 3]) @ T_world_camera[:3, :3]

@@ -1,0 +1,92 @@
+"""All that decides the bytes of a dataset, in one object that can be sent to a worker."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import dataclass, fields
+from importlib.metadata import version
+
+import numpy as np
+
+from endotwin.cameras import Camera
+from endotwin.synth.regions import Region
+from endotwin.synth.trajectories import Trajectory
+from endotwin.synth.variation import Draw
+from endotwin.twin import Twin
+
+LIBRARIES = ("endotwin", "numpy", "torch", "embreex", "opencv-contrib-python-headless", "tifffile")
+
+THUMBNAILS = 24
+
+
+@dataclass(frozen=True, eq=False)
+class Job:
+    """A dataset to render.
+
+    Attributes:
+        twin: fitted, before any edit. camera: of the frames.
+        trajectory: a pose a frame. draws: edits of the twin, one a frame. regions: that the draws refer to.
+        labels: names of labels. images: names of the images that they are written as. layout: its name.
+        shard_frames: frames that are rendered, and counted as done, together.
+        document: the content of ``dataset.json``.
+    """
+
+    twin: Twin
+    camera: Camera
+    trajectory: Trajectory
+    draws: tuple[Draw, ...]
+    regions: tuple[Region, ...]
+    labels: tuple[str, ...]
+    images: tuple[str, ...]
+    layout: str
+    shard_frames: int
+    document: dict
+
+    def __len__(self) -> int:
+        return len(self.trajectory)
+
+    @property
+    def shards(self) -> int:
+        return -(-len(self) // self.shard_frames)
+
+    def shard(self, number: int) -> range:
+        """Indices of the frames of one shard."""
+        first = number * self.shard_frames
+        return range(first, min(first + self.shard_frames, len(self)))
+
+    @property
+    def digits(self) -> int:
+        """Of a frame's number in file names: all of one length, so that they sort."""
+        return max(4, len(str(len(self) - 1)))
+
+    @property
+    def thumbnails(self) -> set[int]:
+        """Indices of the frames that the datasheet shows."""
+        return set(np.linspace(0, len(self) - 1, min(THUMBNAILS, len(self))).round().astype(int).tolist())
+
+    def digest(self) -> str:
+        """SHA-256 of all that decides the bytes: equal for the same command on the same twin and versions."""
+        digest = hashlib.sha256(json.dumps(self.document, sort_keys=True).encode())
+        digest.update(np.ascontiguousarray(self.trajectory.T_world_camera).tobytes())
+        digest.update(np.ascontiguousarray(self.trajectory.timestamps_s).tobytes())
+        digest.update(repr((self.draws, self.shard_frames)).encode())
+        for region in self.regions:
+            digest.update(region.weight.tobytes())
+        return digest.hexdigest()
+
+
+def fingerprint(twin: Twin) -> str:
+    """SHA-256 of all that a rendering depends on: surface, materials, camera, light, response, effects."""
+    digest = hashlib.sha256(json.dumps(twin.effects.to_dict(), sort_keys=True).encode())
+    for part in (twin.surface, twin.camera, twin.materials, twin.light, twin.response):
+        for field in fields(part):
+            value = np.ascontiguousarray(getattr(part, field.name))
+            digest.update(f"{field.name} {value.dtype.str} {value.shape}".encode())
+            digest.update(value.tobytes())
+    return digest.hexdigest()
+
+
+def versions() -> dict[str, str]:
+    """Of the libraries that decide the bytes."""
+    return {library: version(library) for library in LIBRARIES}

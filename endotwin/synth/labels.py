@@ -1,0 +1,206 @@
+"""The labels of a frame: only those that were asked for are computed."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cached_property
+
+import numpy as np
+
+from endotwin.casting import Caster, Correspondences
+from endotwin.errors import OptionError
+from endotwin.incidence import to_camera
+from endotwin.render import Renderer, View, laid_out
+from endotwin.surface import Surface
+from endotwin.synth.flow import flow_to, hides_surface, seen_from, surface_points
+from endotwin.synth.job import Job
+
+MASK_NONE, MASK_FILLED, MASK_UNSEEN, MASK_VALID = 0, 64, 128, 255
+HIDDEN_NONE, HIDDEN_NO, HIDDEN_YES = 128, 0, 255
+
+LABELS: dict[str, tuple[str, ...]] = {
+    "rgb": ("rgb",),
+    "rgb_linear": ("rgb_linear",),
+    "depth": ("depth",),
+    "normals": ("normals",),
+    "mask": ("mask",),
+    "albedo": ("albedo",),
+    "roughness": ("roughness",),
+    "metallic": ("metallic",),
+    "diffuse": ("diffuse",),
+    "flow": ("flow", "flow_hidden"),
+    "flow_forward": ("flow_forward", "flow_forward_hidden"),
+    "occlusion": ("occlusion",),
+    "triangles": ("triangles",),
+}
+"""Labels that may be asked for, and the images that each one is written as."""
+
+DEFAULT_LABELS = ("rgb", "depth", "normals", "mask")
+
+
+def parse_labels(text: str) -> tuple[str, ...]:
+    """Names of labels from ``rgb,depth,…`` or ``all``, in their own order; raises OptionError."""
+    names = [name.strip() for name in text.split(",") if name.strip()]
+    if names == ["all"]:
+        return tuple(LABELS)
+    unknown = [name for name in names if name not in LABELS]
+    if unknown or not names:
+        raise OptionError(
+            f"there is no label {(unknown or [text])[0]!r}; choose from {', '.join(LABELS)}, or 'all'"
+        )
+    return tuple(name for name in LABELS if name in names)
+
+
+def triangle_kinds(surface: Surface) -> np.ndarray:
+    """Uint8 [F]: MASK_VALID where every corner was measured and seen by a training photo, MASK_UNSEEN where
+    one was seen by none, MASK_FILLED where one was not even measured."""
+    filled = surface.filled[surface.triangles].any(axis=1)
+    unseen = (surface.seen_by == 0)[surface.triangles].any(axis=1)
+    kind = np.where(unseen, np.uint8(MASK_UNSEEN), np.uint8(MASK_VALID))
+    return np.where(filled, np.uint8(MASK_FILLED), kind)
+
+
+class Labeller:
+    """Labels the frames of a job; keeps one ray caster, and one renderer for frames of the same draw."""
+
+    def __init__(self, job: Job):
+        self._job = job
+        self._caster = Caster(job.twin.surface, threads=1)
+        self._kinds = triangle_kinds(job.twin.surface)
+        self._shaded: tuple[object, Renderer, Renderer | None] | None = None
+
+    def frame(self, index: int) -> dict[str, np.ndarray]:
+        """The images of frame ``index`` by name, as ``LABELS`` has them."""
+        job = self._job
+        T_world_camera = job.trajectory.T_world_camera[index]
+        images, view = {}, None
+        renderer = specular_free = None
+        if {"rgb", "rgb_linear", "diffuse", "albedo", "roughness", "metallic"} & set(job.labels):
+            renderer, specular_free = self._renderers(index)
+        if {"rgb", "rgb_linear"} & set(job.labels):
+            view = renderer.view(T_world_camera)
+            images = {"rgb": view.color, "rgb_linear": view.radiance}
+        if specular_free is not None:
+            matt = specular_free.view(T_world_camera)
+            images["diffuse"], view = matt.color, view or matt
+        hits = view.hits if view else self._caster.cast(job.camera, T_world_camera)
+        geometry = _Geometry(job, self._caster, hits, index, self._kinds, renderer, view)
+        for name in job.images:
+            if name not in images:
+                images[name] = getattr(geometry, name)
+        return {name: images[name] for name in job.images}
+
+    def _renderers(self, index: int) -> tuple[Renderer, Renderer | None]:
+        """The renderer of the frame's draw, and the one without specular reflection if that is asked for."""
+        draw = self._job.draws[index]
+        kept = self._shaded
+        if kept is None or kept[0] != draw:
+            twin, exposure = draw.edited(self._job.twin, self._job.regions)
+            share = {"camera": self._job.camera, "caster": self._caster, "exposure": exposure}
+            specular_free = None
+            if "diffuse" in self._job.labels:
+                specular_free = Renderer(replace(twin, materials=replace(twin.materials, f0=0.0)), **share)
+            kept = self._shaded = (draw, Renderer(twin, **share), specular_free)
+        return kept[1:]
+
+
+class _Geometry:
+    """The labels of one frame that need no light; each is computed when it is read."""
+
+    def __init__(
+        self,
+        job: Job,
+        caster: Caster,
+        hits: Correspondences,
+        index: int,
+        kinds: np.ndarray,
+        renderer: Renderer | None,
+        view: View | None,
+    ):
+        self._job, self._caster, self._hits, self._index = job, caster, hits, index
+        self._kinds, self._renderer, self._view = kinds, renderer, view
+        self._T_world_camera = job.trajectory.T_world_camera[index]
+
+    def _image(self, values: np.ndarray, empty: float = 0.0) -> np.ndarray:
+        shape = (self._job.camera.height, self._job.camera.width)
+        return laid_out(values, self._hits.pixel, shape, empty)
+
+    def _material(self, name: str) -> np.ndarray:
+        return self._image(
+            self._hits.interpolate(self._job.twin.surface, getattr(self._renderer.twin.materials, name))
+        )
+
+    @property
+    def depth(self) -> np.ndarray:
+        z = self._job.camera.pixel_directions.reshape(-1, 3)[:, 2].take(self._hits.pixel)
+        return self._image(self._hits.distance_mm * z, np.nan)
+
+    @property
+    def normals(self) -> np.ndarray:
+        if self._view:
+            return self._view.normals
+        surface = self._job.twin.surface
+        return self._image(to_camera(self._hits.interpolate(surface, surface.normals), self._T_world_camera))
+
+    @property
+    def albedo(self) -> np.ndarray:
+        return self._material("base_color")
+
+    @property
+    def roughness(self) -> np.ndarray:
+        return self._material("roughness")
+
+    @property
+    def metallic(self) -> np.ndarray:
+        return self._material("metallic")
+
+    @property
+    def mask(self) -> np.ndarray:
+        return self._image(self._kinds[self._hits.triangle], MASK_NONE)
+
+    @property
+    def triangles(self) -> np.ndarray:
+        return self._image(self._hits.triangle, -1)
+
+    @property
+    def occlusion(self) -> np.ndarray:
+        hides = hides_surface(self._points, self._hits, self._caster, self._T_world_camera)
+        return self._image(np.where(hides, np.uint8(255), np.uint8(0)))
+
+    @property
+    def flow(self) -> np.ndarray:
+        return self._flow(self._index - 1)
+
+    @property
+    def flow_forward(self) -> np.ndarray:
+        return self._flow(self._index + 1)
+
+    @property
+    def flow_hidden(self) -> np.ndarray:
+        return self._hidden(self._index - 1)
+
+    @property
+    def flow_forward_hidden(self) -> np.ndarray:
+        return self._hidden(self._index + 1)
+
+    @cached_property
+    def _points(self) -> np.ndarray:
+        return surface_points(self._job.twin.surface, self._hits)
+
+    def _other(self, index: int) -> np.ndarray | None:
+        """The pose of another frame; None where there is none."""
+        poses = self._job.trajectory.T_world_camera
+        return poses[index] if 0 <= index < len(poses) else None
+
+    def _flow(self, index: int) -> np.ndarray:
+        T_world_other = self._other(index)
+        if T_world_other is None:
+            return self._image(np.full((len(self._hits), 2), np.nan), np.nan)
+        return self._image(flow_to(self._points, self._hits.pixel, self._job.camera, T_world_other), np.nan)
+
+    def _hidden(self, index: int) -> np.ndarray:
+        T_world_other = self._other(index)
+        if T_world_other is None:
+            return self._image(np.full(len(self._hits), HIDDEN_NONE, np.uint8), HIDDEN_NONE)
+        seen = seen_from(self._points, self._caster, self._job.camera, T_world_other)
+        return self._image(np.where(seen, np.uint8(HIDDEN_NO), np.uint8(HIDDEN_YES)), HIDDEN_NONE)

@@ -1,0 +1,39 @@
+"""C3VD, versions 1 and 2 (Bobrow et al. 2023)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from endotwin.poses import write_c3vd_poses
+from endotwin.synth.job import Job
+from endotwin.synth.layouts.layout import CAMERA_WORDS, Layout, frame_name, write_camera, write_lines
+
+V1_NAMES = {"rgb": "color"}
+V2_FOLDERS = {"flow": "optical_flow", "occlusion": "occlusions"}
+
+WORDS = {
+    "poses": "pose.txt: a line a frame, the 4x4 camera-to-world matrix column by column (C3VD's order), mm",
+    "camera": CAMERA_WORDS,
+    "timestamps": "timestamps.txt: seconds, a line a frame",
+}
+
+
+def _tables(folder: Path, job: Job) -> None:
+    write_c3vd_poses(folder / "pose.txt", job.trajectory.T_world_camera)
+    write_lines(folder / "timestamps.txt", [repr(float(s)) for s in job.trajectory.timestamps_s])
+    write_camera(folder, job.camera)
+
+
+V1 = Layout(
+    "c3vd",
+    lambda job, index, image, suffix: f"{frame_name(job, index)}_{V1_NAMES.get(image, image)}{suffix}",
+    _tables,
+    WORDS,
+)
+
+V2 = Layout(
+    "c3vd2",
+    lambda job, index, image, suffix: f"{V2_FOLDERS.get(image, image)}/{frame_name(job, index)}{suffix}",
+    _tables,
+    WORDS,
+)

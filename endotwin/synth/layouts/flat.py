@@ -1,0 +1,46 @@
+"""A flat layout with a list of ``image depth`` lines, for fine-tuning metric depth networks."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from endotwin.synth.encodings import depth_png
+from endotwin.synth.job import Job
+from endotwin.synth.layouts.layout import (
+    CAMERA_WORDS,
+    Layout,
+    frame_name,
+    needs,
+    write_camera,
+    write_lines,
+)
+
+FOLDERS = {"rgb": "images"}
+LEVELS_PER_MM = 100
+
+
+def _place(job: Job, index: int, image: str, suffix: str) -> str:
+    return f"{FOLDERS.get(image, image)}/{frame_name(job, index)}{suffix}"
+
+
+def _tables(folder: Path, job: Job) -> None:
+    pairs = [f"{LAYOUT.file(job, i, 'rgb')} {LAYOUT.file(job, i, 'depth')}" for i in range(len(job))]
+    write_lines(folder / "filelist.txt", pairs)
+    write_camera(folder, job.camera)
+
+
+LAYOUT = Layout(
+    "flat",
+    _place,
+    _tables,
+    {
+        "list": "filelist.txt: 'image depth' a line, from the dataset's folder, as Depth Anything V2's "
+        "loaders take "
+        "them; its VKITTI2 loader divides depth by 100, which gives millimetres here: set --max-depth in mm",
+        "poses": "frames.jsonl: T_world_camera, camera to world, mm, camera axes x right, y down, z forward",
+        "camera": CAMERA_WORDS,
+    },
+    {"depth": depth_png(LEVELS_PER_MM, "16-bit z-depth, raw / 100 mm; 0: none")},
+    needs("rgb", "depth"),
+    reads=False,
+)

@@ -1,0 +1,224 @@
+"""A run that stops, is killed or fills the disk goes on, and the finished bytes do not tell."""
+
+import errno
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import psutil
+import pytest
+import tube_twin
+
+from endotwin.errors import OptionError, OutputError
+from endotwin.synth import Trajectory, crew, synthesize
+from endotwin.synth.partial import Partial, partial_path
+from endotwin.twin import Twin
+
+FRAMES = 56
+LABELS = ("rgb", "depth", "mask", "flow")
+
+KILLED = """
+import os, random, signal, sys, time
+sys.path.insert(0, {tests!r})
+from pathlib import Path
+import test_resume
+from endotwin.twin import Twin
+
+twin, out = Twin.load(Path({twin!r})), Path({out!r})
+random.seed(4)
+kills = datasets = 0
+while kills < {kills} or not out.exists():
+    if out.exists():
+        out.rename(out.with_name(f"dataset-{{datasets}}"))
+        datasets += 1
+    child = os.fork()
+    if child == 0:
+        test_resume.render(twin, out)
+        os._exit(0)
+    deadline = time.monotonic() + (random.uniform(0, {longest}) if kills < {kills} else 60)
+    ended = 0
+    while not ended and time.monotonic() < deadline:
+        time.sleep(0.001)
+        ended, status = os.waitpid(child, os.WNOHANG)
+    if not ended:
+        os.kill(child, signal.SIGKILL)
+        os.waitpid(child, 0)
+        kills += 1
+    elif status:
+        sys.exit("a run failed")
+print(kills)
+"""
+"""A process that never renders itself, so that it can fork ones that do; it kills each at a random moment."""
+
+
+def render(twin: Twin, out: Path | str, **options) -> None:
+    """A small dataset of the twin."""
+    poses = np.stack([tube_twin.pose(s) for s in np.linspace(0.1, 0.9, FRAMES)])
+    trajectory = Trajectory(poses, np.arange(FRAMES) / 30, "along the axis")
+    synthesize(twin, trajectory, out, labels=LABELS, **options)
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {str(f.relative_to(folder)): f.read_bytes() for f in sorted(folder.rglob("*")) if f.is_file()}
+
+
+@pytest.fixture(scope="module")
+def twin() -> Twin:
+    return tube_twin.fitted(tube_twin.seen(tube_twin.surface(fold_mm=3.0)))
+
+
+@pytest.fixture(scope="module")
+def whole(twin, tmp_path_factory) -> dict[str, bytes]:
+    """The dataset of a run that nothing interrupted."""
+    out = tmp_path_factory.mktemp("whole") / "dataset"
+    render(twin, out)
+    return contents(out)
+
+
+def test_a_run_killed_50_times_at_random_moments_ends_in_the_same_bytes(twin, whole, tmp_path):
+    twin.save(tmp_path / "twin")
+    script = KILLED.format(
+        tests=str(Path(__file__).parent),
+        twin=str(tmp_path / "twin"),
+        out=str(tmp_path / "dataset"),
+        kills=50,
+        longest=0.3,
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=300)
+    assert done.stdout == "50\n", done.stderr
+    datasets = sorted(tmp_path.glob("dataset*"))
+    assert datasets[0].name == "dataset" and not partial_path(tmp_path / "dataset").exists()
+    for dataset in datasets:
+        assert contents(dataset) == whole
+
+
+def test_two_workers_give_the_bytes_of_one_and_die_with_the_run(twin, whole, tmp_path):
+    twin.save(tmp_path / "twin")
+    out, marks = tmp_path / "dataset", partial_path(tmp_path / "dataset") / "done"
+    script = tmp_path / "run.py"
+    script.write_text(
+        f"import sys; sys.path.insert(0, {str(Path(__file__).parent)!r})\n"
+        "from pathlib import Path\n"
+        "import test_resume\n"
+        "from endotwin.twin import Twin\n"
+        "if __name__ == '__main__':\n"
+        f"    test_resume.render(Twin.load(Path({str(tmp_path / 'twin')!r})), {str(out)!r}, workers=2)\n"
+    )
+    run = subprocess.Popen([sys.executable, script])
+    while run.poll() is None and not (marks.is_dir() and any(marks.iterdir())):
+        time.sleep(0.01)
+    children = psutil.Process(run.pid).children(recursive=True) if run.poll() is None else []
+    run.kill()
+    run.wait()
+    assert not psutil.wait_procs(children, timeout=20)[1]
+    if not out.exists():
+        render(twin, out)
+    assert contents(out) == whole
+
+
+def test_a_dask_cluster_of_two_workers_gives_the_same_bytes(twin, whole, tmp_path):
+    distributed = pytest.importorskip("distributed")
+    with distributed.LocalCluster(2, threads_per_worker=1, dashboard_address=None) as cluster:
+        render(twin, tmp_path / "dataset", scheduler=cluster.scheduler_address)
+    assert contents(tmp_path / "dataset") == whole
+
+
+def test_a_scheduler_that_does_not_answer_is_named_and_nothing_is_left(twin, tmp_path, monkeypatch):
+    pytest.importorskip("distributed")
+    monkeypatch.setattr(crew, "SCHEDULER_TIMEOUT_S", 0.2)
+    with pytest.raises(OptionError, match=r"tcp://127\.0\.0\.1:9"):
+        render(twin, tmp_path / "dataset", scheduler="tcp://127.0.0.1:9")
+    assert list(tmp_path.iterdir()) == []
+
+
+class Enough(Exception):
+    pass
+
+
+def stop_after(shards: int):
+    """Progress that raises once so many shards are done."""
+    calls = []
+
+    def progress(label: str, done: int, total: int) -> None:
+        calls.append(done)
+        if len(calls) == shards:
+            raise Enough
+
+    return progress
+
+
+def test_a_full_disk_stops_the_run_with_one_sentence_and_it_goes_on_when_there_is_room(twin, whole, tmp_path):
+    out = tmp_path / "dataset"
+    with pytest.raises(Enough):
+        render(twin, out, progress=stop_after(2))
+    full = partial_path(out) / "data" / "0040_depth.tiff"
+    full.symlink_to("/dev/full")
+    with pytest.raises(OutputError, match=r"disk is full.*the same command goes on"):
+        render(twin, out)
+    assert not out.exists()
+    full.unlink()
+    render(twin, out)
+    assert contents(out) == whole
+
+
+def test_a_disk_that_is_full_from_the_start_leaves_nothing(twin, tmp_path, monkeypatch):
+    def no_room(path: Path, content: bytes) -> int:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
+
+    monkeypatch.setattr(Path, "write_bytes", no_room)
+    with pytest.raises(OutputError, match="disk is full"):
+        render(twin, tmp_path / "new" / "folder" / "dataset")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_stopped_run_counts_on_from_where_it_was(twin, whole, tmp_path):
+    counted = []
+    with pytest.raises(Enough) as stopped:
+        render(twin, tmp_path / "dataset", progress=stop_after(2))
+    assert "the same command goes on" in stopped.value.__notes__[0]
+    render(twin, tmp_path / "dataset", progress=lambda label, done, total: counted.append(done))
+    assert counted == [32, 48, 56]
+    assert contents(tmp_path / "dataset") == whole
+
+
+def test_another_command_does_not_go_on_with_an_unfinished_dataset(twin, whole, tmp_path):
+    with pytest.raises(Enough):
+        render(twin, tmp_path / "dataset", progress=stop_after(1))
+    with pytest.raises(OutputError, match=r"dataset\.partial is an unfinished dataset of another command"):
+        render(twin, tmp_path / "dataset", seed=1)
+    render(twin, tmp_path / "dataset", overwrite=True)
+    assert contents(tmp_path / "dataset") == whole
+
+
+def test_a_folder_of_someone_else_is_not_taken_for_an_unfinished_dataset(twin, tmp_path):
+    (tmp_path / "dataset.partial").mkdir()
+    (tmp_path / "dataset.partial" / "data").write_text("precious")
+    with pytest.raises(OutputError, match="no unfinished dataset"):
+        render(twin, tmp_path / "dataset", overwrite=True)
+    assert (tmp_path / "dataset.partial" / "data").read_text() == "precious"
+
+
+def test_two_runs_do_not_work_on_one_dataset(twin, tmp_path):
+    def again(label: str, done: int, total: int) -> None:
+        with pytest.raises(OutputError, match="another run"):
+            render(twin, tmp_path / "dataset")
+        raise Enough
+
+    with pytest.raises(Enough):
+        render(twin, tmp_path / "dataset", progress=again)
+
+
+def test_a_run_killed_after_the_dataset_got_its_place_is_tidied_up(twin, whole, tmp_path, monkeypatch):
+    def killed(self) -> None:
+        raise Enough
+
+    with monkeypatch.context() as patch, pytest.raises(Enough):
+        patch.setattr(Partial, "remove", killed)
+        render(twin, tmp_path / "dataset")
+    assert partial_path(tmp_path / "dataset").exists()
+    render(twin, tmp_path / "dataset")
+    assert not partial_path(tmp_path / "dataset").exists()
+    assert contents(tmp_path / "dataset") == whole
