@@ -20,16 +20,6 @@ JPEG_SIGNATURE, JPEG_END = b"\xff\xd8", b"\xff\xd9"
 TIFF_SIGNATURES = (b"II*\x00", b"MM\x00*", b"II+\x00", b"MM\x00+")
 TIFF_OWN_COMPRESSIONS = (1, 8, 32946)  # none and deflate, which tifffile decodes by itself
 TRAILING_BYTES = 64  # what may follow the end marker of a complete JPEG
-TIFF_FAULTS = (  # what tifffile raises, depending on which bytes are wrong
-    tifffile.TiffFileError,
-    zlib.error,
-    struct.error,
-    ValueError,
-    LookupError,
-    TypeError,
-    ArithmeticError,
-    MemoryError,
-)
 OPENCV_LOG = Lock()  # its level is one for the whole process
 
 # A damaged file is told in our own error; without a handler, tifffile's log of it would go to stderr as well.
@@ -113,7 +103,7 @@ def _decode_tiff(path: Path, content: np.ndarray, mode: int) -> np.ndarray | Non
             plain = page.compression in TIFF_OWN_COMPRESSIONS and page.predictor in (1, 2)
             if plain and mode == cv2.IMREAD_UNCHANGED:
                 return page.asarray()
-    except TIFF_FAULTS as error:
+    except Exception as error:  # tifffile raises whatever the wrong bytes lead it to
         raise _damaged(path) from error
     with OPENCV_LOG:
         level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
@@ -126,8 +116,10 @@ def _decode_tiff(path: Path, content: np.ndarray, mode: int) -> np.ndarray | Non
 def _read_npy(path: Path) -> np.ndarray:
     try:
         plane = np.squeeze(np.load(path, allow_pickle=False))
-    except (OSError, ValueError, EOFError) as error:
+    except Exception as error:  # NumPy parses the header as Python, and raises whatever that does
         raise SequenceError(f"{path} is truncated or not a NumPy array; copy the file again") from error
     if plane.ndim != 2:
         raise SequenceError(f"{path} has the shape {plane.shape}; write it as [height, width]")
+    if plane.dtype.kind not in "uif":
+        raise SequenceError(f"{path} holds {plane.dtype}, which is no depth; write numbers")
     return plane

@@ -125,11 +125,16 @@ class Sequence:
 
     @cached_property
     def lens_mask(self) -> np.ndarray:
-        """Bool [H, W]: pixels that the lens illuminates, false in an endoscope image's black surround."""
+        """Bool [H, W]: pixels that the lens illuminates, false in an endoscope image's black surround.
+
+        Raises SequenceError if the photos looked at are all black.
+        """
         spread = np.unique(np.linspace(0, len(self) - 1, SURROUND_FRAMES).round().astype(int))
         brightest = np.zeros(self.image_size[::-1], np.uint8)
         for index in spread:
             np.maximum(brightest, self._native_color(index).max(axis=2), out=brightest)
+        if brightest.max() <= SURROUND_LEVEL:
+            raise SequenceError(f"{self.path} has only black photos; check that they show the lumen")
         lit = (~dark_surround(brightest)).astype(np.float32)
         if self.scale != 1:
             lit = cv2.resize(lit, (self.camera.width, self.camera.height), interpolation=self._interpolation)
@@ -142,10 +147,11 @@ class Sequence:
     def _native_color(self, index: int) -> np.ndarray:
         color = read_color(self.color_files[index])
         if color.shape[1::-1] != self.image_size:
-            raise SequenceError(
-                f"{self.color_files[index]} is {_size(color)}, but the camera is "
-                f"{self.image_size[0]}×{self.image_size[1]}; add a camera.json of these images"
-            )
+            expected = f"{self.image_size[0]}×{self.image_size[1]}"
+            fault = f"the camera is {expected}; add a camera.json of these images"
+            if index > 0:
+                fault = f"the photos before it are {expected}; give it that size, or remove the frame"
+            raise SequenceError(f"{self.color_files[index]} is {_size(color)}, but {fault}")
         return color
 
     def _resized_color(self, color: np.ndarray) -> np.ndarray:

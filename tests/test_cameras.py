@@ -168,6 +168,25 @@ def test_a_broken_camera_json_is_refused_by_name(tmp_path):
         read_camera(tmp_path / "camera.json")
 
 
+@pytest.mark.parametrize(
+    ("parameters", "told"),
+    [
+        ({"fx": 1e-6, "fy": 1e-6}, "90° away from the axis"),
+        ({"fx": 1e8, "fy": 1e8}, "in pixels"),
+        ({"cx": 1e7}, "in pixels"),
+        ({"k1": -50.0}, "check its distortion"),
+    ],
+)
+def test_a_camera_that_sees_nothing_of_use_is_refused(parameters, told):
+    with pytest.raises(CameraError, match=rf"camera\.json: .*{told}"):
+        camera_from_dict({**PLAIN.to_dict(), **parameters}, Path("camera.json"))
+
+
+def test_the_calibrations_see_enough_to_be_read_back():
+    for camera in CALIBRATIONS.values():
+        assert camera_from_dict(camera.to_dict(), Path("camera.json")) == camera
+
+
 @pytest.mark.parametrize("scale", [0, -1, float("nan"), 1e-5])
 def test_a_scale_that_leaves_no_image_is_refused(scale):
     with pytest.raises(OptionError, match="scale"):

@@ -287,13 +287,14 @@ def test_tum_pairs_photos_depth_and_poses_by_time(tmp_path):
     np.testing.assert_array_equal(sequence.color(4), photo(4))
 
 
-def test_tum_leaves_out_a_photo_whose_pose_is_too_far_in_time(tmp_path):
+def test_tum_leaves_out_a_photo_whose_pose_is_too_far_in_time_and_says_how_many(tmp_path, caplog):
     folder = write_tum(tmp_path, truth_poses(4))
     lines = (folder / "groundtruth.txt").read_text().splitlines()
     (folder / "groundtruth.txt").write_text("\n".join(lines[:2] + lines[3:]))  # without the second pose
     sequence = open_sequence(folder)
     np.testing.assert_allclose(sequence.T_world_camera, truth_poses(4)[[0, 2, 3]], atol=1e-9)
     np.testing.assert_allclose(sequence.depth_mm(1), 110 / 5, rtol=1e-6)
+    assert "1 of the 4 photos" in caplog.text
 
 
 def test_tum_needs_intrinsics_and_takes_them_from_calibration_txt(tmp_path):
@@ -409,10 +410,10 @@ def test_a_pose_that_is_not_rigid(tmp_path):
     refused(folder, "pose.txt, line 2", "not rigid")
 
 
-def test_a_mirrored_pose_is_not_rigid(tmp_path):
+def test_a_mirrored_pose_is_called_left_handed(tmp_path):
     folder = write_c3vd(tmp_path / "c3vd")
     edit_pose(folder, 3, lambda pose: pose @ np.diag([1, -1, 1, 1]))
-    refused(folder, "pose.txt, line 3", "not rigid")
+    refused(folder, "pose.txt, line 3", "not rigid", "left-handed (determinant −1)")
 
 
 def test_a_transposed_pose_says_that_its_transpose_would_be_rigid(tmp_path):
@@ -444,6 +445,43 @@ def test_depth_and_colour_of_different_size(tmp_path):
 def test_images_of_another_size_than_the_camera(tmp_path):
     folder = write_c3vd(tmp_path / "c3vd", camera={**CAMERA, "width": 128, "height": 96})
     refused(folder, "0000_color.png is 64×48", "128×96", "camera.json")
+
+
+def test_one_photo_of_another_size_than_the_others(tmp_path):
+    folder = write_c3vd(tmp_path / "c3vd")
+    png(folder / "0002_color.png", photo(2, (24, 32)))
+    refused(folder, "0002_color.png is 32×24", "the photos before it are 64×48")
+
+
+def test_a_frame_that_lacks_photo_and_depth_is_named(tmp_path):
+    folder = write_c3vd(tmp_path / "c3vd", count=4)
+    for name in ("0002_color.png", "0002_depth.tiff"):
+        (folder / name).unlink()
+    refused(folder, "3 frames but 4 poses", "number 2")
+
+
+def test_a_json_file_that_is_no_transforms_file(tmp_path):
+    refused(
+        write_c3vd(tmp_path / "c3vd") / "camera.json", "camera.json has no list 'frames'", "name the folder"
+    )
+
+
+def test_the_folder_above_a_sequence_names_the_sequence(tmp_path):
+    refused(write_simcol(tmp_path / "scene", truth_poses(2)).parent, "name ", "Frames_S1")
+
+
+@pytest.mark.parametrize(
+    ("format", "file"),
+    [("simcol", "FrameBuffer_0000.png"), ("tum", "rgb.txt"), ("transforms", "transforms.json")],
+)
+def test_a_forced_layout_that_is_not_there_names_the_file_that_it_lacks(tmp_path, format, file):
+    refused(write_c3vd(tmp_path / "c3vd"), file, format=format)
+
+
+def test_photos_are_not_enlarged(tmp_path):
+    folder = write_c3vd(tmp_path / "c3vd")
+    with pytest.raises(OptionError, match="choose 1 or less"):
+        open_sequence(folder, scale=20)
 
 
 def test_depth_that_is_not_16_bit(tmp_path):

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import MISSING, fields
 from math import isfinite
 from pathlib import Path
+
+import numpy as np
 
 from endotwin.cameras.base import Camera
 from endotwin.cameras.fisheye import Fisheye
 from endotwin.cameras.omni import Omni
 from endotwin.cameras.pinhole import Pinhole
 from endotwin.errors import CameraError
+from endotwin.jsontext import parsed
 
 __all__ = [
     "CALIBRATIONS",
@@ -23,6 +25,17 @@ __all__ = [
     "camera_from_dict",
     "read_camera",
 ]
+
+VIEW_GRID = 24
+"""A camera is judged by so many pixels a side."""
+
+LEAST_SEEING = 0.1
+WIDE_VIEW_DEG = 175.0
+VIEW_DEG = (0.1, 80.0)
+"""The median pixel of a camera that is of use looks so far from its axis; one that no pinhole is may see wider."""
+
+LARGEST = 1e9
+"""Magnitude beyond which no parameter of a camera in pixels makes sense."""
 
 MODELS: dict[str, type[Camera]] = {cls.model: cls for cls in (Pinhole, Fisheye, Omni)}
 
@@ -80,23 +93,46 @@ def camera_from_dict(description: dict, where: Path) -> Camera:
             values[field.name] = _number(model, field.name, description[field.name], where)
         elif field.default is MISSING:
             raise CameraError(f"{where}: key {field.name!r} is missing from the {model.model} camera; add it")
-    return model(**values)
+    camera = model(**values)
+    _require_view(camera, where)
+    return camera
 
 
 def read_camera(path: Path) -> Camera:
     """The camera in a ``camera.json``; raises CameraError where it is no camera."""
     try:
-        description = json.loads(Path(path).read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
+        description = parsed(Path(path).read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
         raise CameraError(
             f"{path} cannot be read as JSON ({error}); write it as {_example(Pinhole)}"
         ) from error
     return camera_from_dict(description, path)
 
 
+def _require_view(camera: Camera, where: Path) -> None:
+    """Raise CameraError unless pixels all over the image see something, and not all the same or all aside."""
+    u, v = (np.linspace(0, size - 1, VIEW_GRID) for size in (camera.width, camera.height))
+    with np.errstate(all="ignore"):
+        z = camera.directions(np.stack(np.meshgrid(u, v), axis=-1))[..., 2]
+    seeing = np.isfinite(z).mean()
+    if seeing < LEAST_SEEING:
+        raise CameraError(
+            f"{where}: only {seeing:.0%} of the pixels see anything through this lens; check its distortion"
+        )
+    aside_deg = np.degrees(np.arccos(np.clip(np.nanmedian(z), -1, 1)))
+    widest_deg = VIEW_DEG[1] if camera.model == "pinhole" else WIDE_VIEW_DEG
+    if not VIEW_DEG[0] < aside_deg < widest_deg:
+        raise CameraError(
+            f"{where}: the typical pixel looks {aside_deg:.3g}° away from the axis; check the focal length "
+            "and the centre, which are in pixels"
+        )
+
+
 def _number(model: type[Camera], key: str, value: object, where: Path) -> float | int:
     if isinstance(value, bool) or not isinstance(value, int | float) or not isfinite(value):
         raise CameraError(f"{where}: {key!r} is {value!r}, but must be a finite number")
+    if abs(value) > LARGEST:
+        raise CameraError(f"{where}: {key!r} is {float(value):g}, larger than any camera's; mend it")
     if key in ("width", "height"):
         if value != int(value) or value < 1:
             raise CameraError(

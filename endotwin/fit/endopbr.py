@@ -12,12 +12,15 @@ import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
 from endotwin import shading
+from endotwin.errors import SequenceError
+from endotwin.fit.checkpoint import Checkpoint, identity
 from endotwin.fit.start import ALBEDO_TOP
 from endotwin.hashgrid import corner_slots
 from endotwin.incidence import COS_MIN, unit
@@ -29,12 +32,17 @@ LEVELS, FEATURES, LOG2_SLOTS = 16, 2, 19
 COARSEST_CELLS, FINEST_CELLS = 16, 2048
 """Cells along the scene's longest side at the first and the last level (Müller et al. 2022, table 1)."""
 
+MARGIN = 0.01
+"""The grid reaches this part of the scene's longest side beyond the surface."""
+
 HIDDEN = 64
 IMAGES_A_STEP, PIXELS_A_STEP = 5, 30_000
 DEFAULT_EPOCHS = 100
 LEARNING_RATE = 1e-2
 METALLIC_WEIGHT, GRADIENT_WEIGHT = 1e-4, 1e-3
 BAKE_CHUNK = 1 << 16
+BAKE_SHARE = 0.6
+"""Time that a vertex takes to bake, in shares of a training pixel's: a budget leaves that much."""
 
 
 class Field(nn.Module):
@@ -130,51 +138,69 @@ def fit_endopbr(
     epochs: int | None,
     seed: int,
     progress: Callable[[str, int, int], None] | None = None,
+    checkpoint: Path | None = None,
 ) -> Twin:
     """Train for ``epochs`` passes over the training images, or until ``budget_s`` seconds are up, whichever
     is first.
+
+    A training that was stopped goes on from the file ``checkpoint``, which is removed at the end. The twin is
+    that of a training that was not stopped, bit for bit on one machine.
+
+    Raises:
+        SequenceError: the training photos show nothing of the surface.
     """
     stopwatch = Stopwatch()
+    seen = twin.surface.seen_by > 0
+    if not seen.any():
+        raise SequenceError(
+            f"the training photos of {twin.source.path} show nothing of the surface; "
+            "check that poses and depth fit it"
+        )
     torch.manual_seed(seed)
-    generator = np.random.default_rng(seed)
     vertices = twin.surface.vertices_mm.astype(np.float64)
-    field = Field(vertices.min(axis=0) - 1, vertices.max(axis=0) + 1)
-    shared = SharedParameters(float(np.median(twin.surface.nearest_mm[twin.surface.seen_by > 0])))
+    low_mm, high_mm = vertices.min(axis=0), vertices.max(axis=0)
+    margin_mm = MARGIN * (high_mm - low_mm).max()
+    field = Field(low_mm - margin_mm, high_mm + margin_mm)
+    shared = SharedParameters(float(np.median(twin.surface.nearest_mm[seen])))
     optimizer = torch.optim.Adam([*field.parameters(), *shared.parameters()], lr=LEARNING_RATE, eps=1e-15)
-    sequence = twin.source.open()
+    sequence = twin.sequence()
     frames = twin.source.training(len(sequence))
     per_epoch = math.ceil(len(frames) / IMAGES_A_STEP)
     steps = per_epoch * (epochs or (10**6 if budget_s else DEFAULT_EPOCHS))
-    started, done = time.perf_counter(), 0
+    kept = Checkpoint(checkpoint, identity(twin, seed, LOG2_SLOTS, PIXELS_A_STEP, LEARNING_RATE), optimizer)
+    first, spent = kept.resume()
+    done, started = first, time.perf_counter() - spent
 
-    def batch(chosen: np.ndarray) -> dict[str, np.ndarray]:
+    def batch(step: int) -> dict[str, np.ndarray] | None:
+        """Pixels of the images that are due; None where those have no depth."""
+        epoch, turn = divmod(step, per_epoch)
+        order = np.random.default_rng((seed, epoch)).permutation(len(frames))
+        chosen = order[turn * IMAGES_A_STEP : (turn + 1) * IMAGES_A_STEP]
         parts = [photo_geometry(twin, sequence.frame(frames[index]), sequence.lens_mask) for index in chosen]
         joined = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
-        picked = generator.integers(0, len(joined["cos"]), PIXELS_A_STEP)
+        if not len(joined["cos"]):
+            return None
+        picked = np.random.default_rng((seed, epoch, turn)).integers(0, len(joined["cos"]), PIXELS_A_STEP)
         return {name: values[picked] for name, values in joined.items()}
 
-    with stopwatch.stage("train"), ThreadPoolExecutor(1) as reader:
-        choose = _image_order(len(frames), generator)
-        ahead = reader.submit(batch, next(choose))
-        for done in range(1, steps + 1):
-            pixels, ahead = ahead.result(), reader.submit(batch, next(choose))
-            _step(field, shared, optimizer, pixels)
+    with stopwatch.stage("train"), kept.told_when_stopped(), ThreadPoolExecutor(1) as reader:
+        ahead = reader.submit(batch, first)
+        for done in range(first + 1, steps + 1):
+            pixels, ahead = ahead.result(), reader.submit(batch, done)
+            if pixels is not None:
+                _step(field, shared, optimizer, pixels)
             if progress:
-                progress("train", done, steps)
-            if budget_s is not None and time.perf_counter() - started >= budget_s:
+                progress(f"train, resumed at step {first}" if first else "train", done, steps)
+            elapsed_s = time.perf_counter() - started
+            bake_s = BAKE_SHARE * len(vertices) / PIXELS_A_STEP * elapsed_s / done
+            if budget_s is not None and elapsed_s + bake_s >= budget_s:
                 break
+            kept.keep(done, time.perf_counter() - started)
     with stopwatch.stage("bake"):
         materials, light = _baked(field, shared, twin)
+    kept.remove()
     record = {"method": "endopbr", "steps": done, "epochs": done / per_epoch, **stopwatch.to_dict()}
     return replace(twin, materials=materials, light=light, response=shared.response).with_record(fit=record)
-
-
-def _image_order(count: int, generator: np.random.Generator):
-    """IMAGES_A_STEP image indices at a time; every image once an epoch."""
-    while True:
-        order = generator.permutation(count)
-        for start in range(0, count, IMAGES_A_STEP):
-            yield order[start : start + IMAGES_A_STEP]
 
 
 def _step(field: Field, shared: SharedParameters, optimizer: torch.optim.Optimizer, pixels: dict) -> None:

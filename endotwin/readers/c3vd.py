@@ -41,17 +41,30 @@ def read(path: Path) -> Sequence:
         version, color = "c3vd-v1", numbered_files(path, COLOR_V1)
         depth = numbered_files(path, DEPTH_V1)
     color_files, depth_files = paired(color, depth, path)
+    T_world_camera = read_c3vd_poses(path / "pose.txt")
+    if len(T_world_camera) > len(color):
+        _check_complete(list(color), len(T_world_camera), path)
     calibration = path / "camera.json"
     return Sequence(
         path=path,
         format="c3vd",
         camera=read_camera(calibration) if calibration.is_file() else CALIBRATIONS[version],
-        T_world_camera=read_c3vd_poses(path / "pose.txt"),
+        T_world_camera=T_world_camera,
         color_files=color_files,
         depth_files=depth_files,
         read_depth_mm=read_depth_mm,
         timestamps_s=np.fromiter(color, np.float64) / FRAMES_PER_SECOND,
     )
+
+
+def _check_complete(numbers: list[int], poses: int, path: Path) -> None:
+    """Raise SequenceError that names the first number that the frames leave out, if they leave one out."""
+    absent = next((n for n in range(numbers[0], numbers[-1]) if n not in numbers), None)
+    if absent is not None:
+        raise SequenceError(
+            f"{path} has {len(numbers)} frames but {poses} poses: there is no photo and depth map of number "
+            f"{absent}; add them, or remove its line from pose.txt"
+        )
 
 
 def read_depth_mm(path: Path) -> np.ndarray:

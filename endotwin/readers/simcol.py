@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from endotwin.cameras import Camera, Pinhole, read_camera
+from endotwin.cameras import Camera, Pinhole, camera_from_dict, read_camera
 from endotwin.errors import CameraError, SequenceError
 from endotwin.images import read_plane
 from endotwin.poses import FRAMES_PER_SECOND, from_quaternions, numeric_rows
@@ -82,7 +82,9 @@ def _camera(path: Path) -> Camera:
         raise CameraError(
             f"{file} has no positive focal lengths; mend it, or put a camera.json beside the frames"
         )
-    return Pinhole(SIZE, SIZE, fx=K[0, 0], fy=K[1, 1], cx=K[0, 2] - 0.5, cy=K[1, 2] - 0.5)
+    (fx, _, cx), (_, fy, cy), _ = K.tolist()
+    size = {"model": "pinhole", "width": SIZE, "height": SIZE}
+    return camera_from_dict({**size, "fx": fx, "fy": fy, "cx": cx - 0.5, "cy": cy - 0.5}, file)
 
 
 def _poses(path: Path) -> np.ndarray:

@@ -7,6 +7,7 @@ folder needs a ``camera.json``, or a ``calibration.txt`` of 'fx fy cx cy'.
 
 from __future__ import annotations
 
+import logging
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +22,8 @@ MARK = "rgb.txt and depth.txt"
 MM_PER_LEVEL = 1000 / 5000
 NEAR_S = 0.02
 LISTS = ("rgb.txt", "depth.txt", "groundtruth.txt")
+
+logger = logging.getLogger("endotwin")
 
 
 def detects(path: Path) -> bool:
@@ -40,6 +43,11 @@ def read(path: Path) -> Sequence:
     if not len(kept):
         raise SequenceError(
             f"{path} has no photo with a depth map and a pose within {NEAR_S} s; check their timestamps"
+        )
+    if len(kept) < len(color_files):
+        logger.warning(
+            "%d of the %d photos of %s have no depth map and pose within %g s and are left out",
+            *(len(color_files) - len(kept), len(color_files), path, NEAR_S),
         )
     return Sequence(
         path=path,

@@ -1,0 +1,101 @@
+"""A long training on disk: written whole now and then, so that the same command can go on from there."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict
+from pathlib import Path
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+
+from endotwin.output import whole_file
+from endotwin.twin import Twin
+
+EVERY_S = 60.0
+
+
+class Checkpoint:
+    """Parameters and Adam's moments of one training.
+
+    Args:
+        path: the file; None: nothing is kept.
+        identity: what the training depends on. A file of another one is not gone on from, and is replaced.
+    """
+
+    def __init__(self, path: Path | None, identity: str, optimizer: torch.optim.Adam):
+        self._path, self._identity, self._optimizer = path, identity, optimizer
+        self._parameters = [each for group in optimizer.param_groups for each in group["params"]]
+        self._written = time.perf_counter()
+
+    def resume(self) -> tuple[int, float]:
+        """Steps done and seconds spent by the training that was stopped, its state restored; 0 and 0.0 if
+        none."""
+        if self._path is None or not self._path.exists():
+            return 0, 0.0
+        try:
+            with safe_open(self._path, "pt") as file:
+                about = file.metadata()
+                if about["identity"] != self._identity:
+                    return 0, 0.0
+                kept = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+            self._restore(kept, int(about["step"]))
+            return int(about["step"]), float(about["seconds"])
+        except (OSError, SafetensorError, KeyError, TypeError, ValueError, RuntimeError):
+            return 0, 0.0  # damaged: the training starts anew
+
+    def keep(self, step: int, seconds: float) -> None:
+        """Write the state after ``step`` if the last time was EVERY_S seconds ago."""
+        if self._path is None or time.perf_counter() - self._written < EVERY_S:
+            return
+        tensors = {}
+        for number, parameter in enumerate(self._parameters):
+            moments = self._optimizer.state[parameter]
+            tensors[f"{number}.value"] = parameter.detach()
+            tensors[f"{number}.exp_avg"], tensors[f"{number}.exp_avg_sq"] = (
+                moments["exp_avg"],
+                moments["exp_avg_sq"],
+            )
+        about = {"identity": self._identity, "step": str(step), "seconds": repr(seconds)}
+        with whole_file(self._path, overwrite=True) as file:
+            save_file(tensors, file, about)
+        self._written = time.perf_counter()
+
+    @contextmanager
+    def told_when_stopped(self) -> Iterator[None]:
+        """Whoever stops the block is told that it can go on."""
+        try:
+            yield
+        except BaseException as stop:
+            if self._path is not None and self._path.exists():
+                stop.add_note("nothing was written yet; the same command goes on from here")
+            raise
+
+    def remove(self) -> None:
+        """The training is done."""
+        if self._path is not None:
+            self._path.unlink(missing_ok=True)
+
+    def _restore(self, kept: dict[str, torch.Tensor], step: int) -> None:
+        with torch.no_grad():
+            for number, parameter in enumerate(self._parameters):
+                shape = parameter.shape
+                value, mean, square = (
+                    kept[f"{number}.{name}"].reshape(shape) for name in ("value", "exp_avg", "exp_avg_sq")
+                )
+                parameter.copy_(value)
+                moments = {"step": torch.tensor(float(step)), "exp_avg": mean, "exp_avg_sq": square}
+                self._optimizer.state[parameter] = moments
+
+
+def identity(twin: Twin, *settings: object) -> str:
+    """A digest of the surface, the sequence and ``settings``: equal for the same training, and only then."""
+    digest = hashlib.sha256(json.dumps([asdict(twin.source), twin.camera.to_dict(), *settings]).encode())
+    digest.update(twin.surface.vertices_mm.tobytes())
+    digest.update(twin.surface.triangles.tobytes())
+    return digest.hexdigest()
