@@ -156,7 +156,7 @@ def test_carve_removes_a_planted_membrane_and_patch_fills_a_planted_hole(tube, f
     assert disagreement(tube, damaged) > disagreement(tube, fused_tube) + 0.05
     frames = range(len(tube))
     for _ in range(2):
-        damaged = reconciled(tube.camera, damaged, read_views(tube, frames), TOLERANCE, VOXEL_MM)
+        damaged, _ = reconciled(tube.camera, damaged, read_views(tube, frames), TOLERANCE, VOXEL_MM)
     assert disagreement(tube, damaged) < disagreement(tube, fused_tube) + 1e-3
     inner = np.hypot(*(damaged.vertices_mm + damaged.origin_mm)[:, :2].T) < 6
     near_end = np.abs((damaged.vertices_mm + damaged.origin_mm)[:, 2]) > 40
@@ -167,14 +167,15 @@ def test_a_patch_does_not_lie_twice(tube, fused_tube):
     centre = fused_tube.vertices_mm[fused_tube.triangles].mean(axis=1) + fused_tube.origin_mm
     hole = np.hypot(centre[:, 0] - 12, centre[:, 2] - 5) < 3
     damaged = surface_of(fused_tube.origin_mm, fused_tube.vertices_mm, fused_tube.triangles[~hole])
-    patched = reconciled(tube.camera, damaged, read_views(tube, range(len(tube))), TOLERANCE, VOXEL_MM)
+    patched, _ = reconciled(tube.camera, damaged, read_views(tube, range(len(tube))), TOLERANCE, VOXEL_MM)
 
     def area_mm2(surface):
         a, b, c = surface.vertices_mm[surface.triangles].transpose(1, 0, 2)
         return np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2
 
     removed = area_mm2(fused_tube) - area_mm2(damaged)
-    undamaged = reconciled(tube.camera, fused_tube, read_views(tube, range(len(tube))), TOLERANCE, VOXEL_MM)
+    views = read_views(tube, range(len(tube)))
+    undamaged, _ = reconciled(tube.camera, fused_tube, views, TOLERANCE, VOXEL_MM)
     patched_mm2 = area_mm2(patched) - area_mm2(undamaged) + removed
     assert patched_mm2 == pytest.approx(removed, rel=0.3)
 

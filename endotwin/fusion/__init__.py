@@ -7,9 +7,13 @@ from collections.abc import Sequence as Indices
 
 import numpy as np
 
+from endotwin.ahead import ahead
 from endotwin.errors import OptionError
 from endotwin.fusion.agreement import Tolerance, measured_noise
 from endotwin.fusion.coverage import covered
+from endotwin.fusion.denoise import denoised, pixel_noise
+from endotwin.fusion.doubts import doubt_frames, doubt_positions, doubt_scatter
+from endotwin.fusion.holes import filled
 from endotwin.fusion.mesh import surface_of, without_short_edges
 from endotwin.fusion.reconcile import reconciled
 from endotwin.fusion.refine import refined
@@ -27,6 +31,8 @@ SHORTEST_EDGE_VOXELS = 0.25
 COARSE_VOXELS = 2.5
 """The noise is measured about a surface this many times coarser, whose truncation band it rarely leaves."""
 REACH_SIGMAS = 3.0
+WIDTH_PX = 4.0
+"""Distances are averaged over so many pixels where their noise is as large as the finest voxel."""
 
 Progress = Callable[[str, int, int], None]
 
@@ -36,18 +42,20 @@ def fuse(
     frames: Indices[int] | None = None,
     photo_frames: Indices[int] | None = None,
     voxel_mm: float | None = None,
+    voxel: float = 1.0,
     progress: Progress | None = None,
 ) -> Surface:
     """The surface that agrees with the depth maps of ``frames``; the same input gives the same mesh.
 
-    TSDF fusion, vertices refined against the depth maps, two rounds of carve and patch, coverage. A few
-    frames are in memory at a time. A frame without any valid depth is skipped with a warning in the log
-    ``endotwin``.
+    TSDF fusion, vertices refined against the depth maps, two rounds of carve and patch, small holes filled,
+    coverage. Noise that differs from pixel to pixel is averaged out first. A few frames are in memory at a
+    time. A frame without any valid depth is skipped with a warning in the log ``endotwin``.
 
     Args:
         frames: indices whose depth may be used; all unless given.
         photo_frames: indices that count for the coverage; ``frames`` unless given.
         voxel_mm: voxel edge of the TSDF; chosen from the pixel footprint and the noise unless given.
+        voxel: factor on the edge that is chosen.
         progress: called with (stage, done, total) as each frame of a stage begins.
 
     Raises:
@@ -60,27 +68,43 @@ def fuse(
         raise OptionError("No frames are left to fuse; choose at least one.")
     if voxel_mm is not None and not voxel_mm > 0:
         raise OptionError(f"The voxel size is {voxel_mm:g} mm, but must be greater than 0.")
+    sequence.require_valid_depth()
     camera, sample = sequence.camera, _spread(frames)
 
-    def views(stage: str, chosen: list[int] = frames, warn: bool = False) -> Iterator[View]:
+    def measured(stage: str, chosen: list[int] = frames, warn: bool = False) -> Iterator[View]:
         return read_views(sequence, _reported(stage, chosen, progress), warn)
 
-    finest_mm, median_mm = footprint_voxel_mm(camera, views("voxel size", sample))
-    origin_mm = np.asarray(sequence.T_world_camera, np.float64)[frames, :3, 3].mean(axis=0)
+    finest_mm, median_mm = footprint_voxel_mm(camera, measured("voxel size", sample))
+    scatter = pixel_noise(measured("pixel noise", sample))
+    width_px = WIDTH_PX * scatter * median_mm / finest_mm
+
+    def views(stage: str, chosen: list[int] = frames, warn: bool = False) -> Iterator[View]:
+        read = measured(stage, chosen, warn)
+        return read if width_px < 1 else ahead(lambda view: denoised(view, scatter, width_px), read)
+
+    doubt_positions(sequence, frames, median_mm)
+    if voxel_mm is not None and voxel_mm > median_mm:
+        raise OptionError(
+            f"A voxel of {voxel_mm:g} mm is larger than the usual depth, {median_mm:.3g} mm; choose less."
+        )
+    origin_mm = np.median(np.asarray(sequence.T_world_camera, np.float64)[frames, :3, 3], axis=0)
     coarse_mm = COARSE_VOXELS * max(finest_mm, voxel_mm or 0.0)
     coarse = fuse_tsdf(camera, views("noise", sample), origin_mm, coarse_mm, noise_mm=0.0)
     noise = measured_noise(camera, surface_of(origin_mm, *coarse), views("noise", sample))
-    voxel_mm = max(finest_mm, noise * median_mm) if voxel_mm is None else voxel_mm
+    voxel_mm = voxel * max(finest_mm, noise * median_mm) if voxel_mm is None else voxel_mm
     tolerance = Tolerance.of(voxel_mm, noise)
+    doubt_scatter(sequence, max(noise, scatter))
 
     vertices_mm, triangles = fuse_tsdf(
-        camera, views("fuse", warn=True), origin_mm, voxel_mm, noise * median_mm
+        camera, views("TSDF", warn=True), origin_mm, voxel_mm, noise * median_mm
     )
     vertices_mm, triangles = without_short_edges(vertices_mm, triangles, SHORTEST_EDGE_VOXELS * voxel_mm)
     surface = surface_of(origin_mm, vertices_mm, triangles)
     surface = refined(camera, surface, views("refine"), max(voxel_mm, REACH_SIGMAS * noise * median_mm))
-    for stage in ("carve and patch", "carve and patch again"):
-        surface = reconciled(camera, surface, views(stage), tolerance, voxel_mm)
+    surface, agreeing = reconciled(camera, surface, views("carve and patch"), tolerance, voxel_mm)
+    doubt_frames(sequence, agreeing)
+    surface, _ = reconciled(camera, surface, views("carve and patch again"), tolerance, voxel_mm)
+    surface = filled(camera, surface, views("fill holes"), tolerance, voxel_mm)
     surface = smoothed(surface)
     return covered(camera, surface, views("coverage", photo_frames), sequence.lens_mask, tolerance)
 

@@ -93,7 +93,7 @@ def measured_noise(camera: Camera, surface: Surface, views: Iterable[View]) -> f
     """
     spreads = []
     for seen in compare(camera, surface, views, Tolerance(np.inf, 0.0)):
-        hit = seen.at
+        hit = np.isfinite(seen.residual_mm)
         if hit.any():
             measured_mm = seen.view.distance_mm.reshape(-1)[hit]
             spreads.append(np.median(np.abs(seen.residual_mm[hit]) / measured_mm))

@@ -32,7 +32,7 @@ def covered(
     def seen_in(view: View) -> Sighting:
         seen = sighting(camera, surface, view.T_world_camera)
         column, row = np.rint(seen.uv).astype(np.int32).T
-        nearest_mm, farthest_mm = _about(view.distance_mm, seen.uv)
+        nearest_mm, farthest_mm = about(view.distance_mm, seen.uv)
         clear = seen.distance_mm <= nearest_mm + tolerance.at(nearest_mm)
         unsure = np.flatnonzero(~clear & (seen.distance_mm <= farthest_mm + tolerance.at(farthest_mm)))
         clear[unsure] = _reached(caster, view.T_world_camera, seen[unsure])
@@ -49,7 +49,7 @@ def covered(
     return surface.with_coverage(seen_by, best_cosine, nearest_mm)
 
 
-def _about(distance_mm: np.ndarray, uv: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def about(distance_mm: np.ndarray, uv: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Least and greatest distance [N] that the four pixels about ``uv`` [N, 2] measured; -inf where none
     did."""
     height, width = distance_mm.shape

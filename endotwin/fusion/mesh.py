@@ -9,8 +9,10 @@ from scipy.sparse.csgraph import connected_components
 from endotwin.surface import Surface
 
 
-def surface_of(origin_mm: np.ndarray, vertices_mm: np.ndarray, triangles: np.ndarray) -> Surface:
-    """An unseen surface about ``origin_mm`` from local vertices [V, 3].
+def surface_of(
+    origin_mm: np.ndarray, vertices_mm: np.ndarray, triangles: np.ndarray, filled: np.ndarray | None = None
+) -> Surface:
+    """An unseen surface about ``origin_mm`` from local vertices [V, 3], of which some are ``filled`` [V].
 
     Triangles that lie on one another are dropped, so are those about a vertex that has no normal, and
     vertices that no triangle uses.
@@ -30,7 +32,7 @@ def surface_of(origin_mm: np.ndarray, vertices_mm: np.ndarray, triangles: np.nda
         seen_by=np.zeros(count, np.int32),
         best_cosine=np.zeros(count, np.float32),
         nearest_mm=np.full(count, np.inf, np.float32),
-        filled=np.zeros(count, bool),
+        filled=np.zeros(count, bool) if filled is None else filled[used],
     )
 
 
@@ -70,9 +72,19 @@ def proper(triangles: np.ndarray) -> np.ndarray:
     return (a != b) & (b != c) & (c != a)
 
 
+def boundary_edges(triangles: np.ndarray) -> np.ndarray:
+    """Directed edges [B, 2] of triangles [F, 3] that no neighbour has the other way round."""
+    edges = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]]).astype(
+        np.int64
+    )
+    count = int(triangles.max(initial=0)) + 1
+    there, back = edges[:, 0] * count + edges[:, 1], edges[:, 1] * count + edges[:, 0]
+    return edges[~np.isin(there, back)]
+
+
 def pieces(vertex_count: int, triangles: np.ndarray) -> np.ndarray:
     """The connected piece, int [F], that each of ``triangles`` [F, 3] belongs to."""
-    return _joined(vertex_count, np.concatenate([triangles[:, :2], triangles[:, 1:]]))[triangles[:, 0]]
+    return joined(vertex_count, np.concatenate([triangles[:, :2], triangles[:, 1:]]))[triangles[:, 0]]
 
 
 def without_short_edges(
@@ -82,7 +94,7 @@ def without_short_edges(
     edges = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
     edges = edges[edges[:, 0] < edges[:, 1]]
     short = np.linalg.norm(vertices_mm[edges[:, 0]] - vertices_mm[edges[:, 1]], axis=1) < shortest_mm
-    number = _joined(len(vertices_mm), edges[short])
+    number = joined(len(vertices_mm), edges[short])
     count = np.bincount(number)
     mean_mm = np.stack([np.bincount(number, axis) / count for axis in vertices_mm.T], axis=1).astype(
         np.float32
@@ -91,7 +103,7 @@ def without_short_edges(
     return mean_mm, triangles[proper(triangles)]
 
 
-def _joined(count: int, edges: np.ndarray) -> np.ndarray:
+def joined(count: int, edges: np.ndarray) -> np.ndarray:
     """Number of the connected component, in order of first appearance, of ``count`` vertices under
     ``edges`` [E, 2]."""
     graph = coo_array((np.ones(len(edges), bool), edges.T), shape=(count, count))

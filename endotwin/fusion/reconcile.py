@@ -17,15 +17,20 @@ from endotwin.surface import Surface
 
 def reconciled(
     camera: Camera, surface: Surface, views: Iterable[View], tolerance: Tolerance, voxel_mm: float
-) -> Surface:
+) -> tuple[Surface, dict[int, float]]:
     """``surface`` without what hides measured pixels, and with what they lack; each view is cast once.
 
     A hole that carving opens is patched by the next call, and a patch that other views see through is
     carved by it.
+
+    Returns:
+        the surface, and by frame the share of its measured pixels that agreed with the one before.
     """
     votes, patches = Votes(surface), Patches(camera, surface, voxel_mm)
+    agreeing = {}
     for seen in compare(camera, surface, views, tolerance):
         votes.add(seen)
         patches.add(seen)
+        agreeing[seen.view.index] = float(seen.at.sum() / np.isfinite(seen.view.distance_mm).sum())
     triangles = np.concatenate([surface.triangles[votes.kept()], patches.triangles])
-    return surface_of(surface.origin_mm, patches.vertices_mm, triangles)
+    return surface_of(surface.origin_mm, patches.vertices_mm, triangles), agreeing

@@ -32,10 +32,12 @@ def smoothed(surface: Surface) -> Surface:
     if crumple_deg(surface) <= CRUMPLED_DEG:
         return surface
     mesh = trimesh.Trimesh(surface.vertices_mm, surface.triangles, process=False)
-    neighbours = _neighbour_mean(surface)
+    neighbours = neighbour_mean(len(surface.vertices_mm), surface.triangles)
+    filled = surface.filled
     for _ in range(TAUBIN_ROUNDS):
         trimesh.smoothing.filter_taubin(mesh, TAUBIN_SHRINK, TAUBIN_GROW, TAUBIN_STEPS, neighbours)
-        surface = surface_of(surface.origin_mm, np.asarray(mesh.vertices, np.float32), mesh.faces)
+        vertices_mm = np.asarray(mesh.vertices, np.float32)
+        surface = surface_of(surface.origin_mm, vertices_mm, mesh.faces, filled)
         if crumple_deg(surface) <= CRUMPLED_DEG:
             return surface
     for _ in range(NORMAL_ROUNDS):
@@ -57,13 +59,12 @@ def crumple_deg(surface: Surface) -> float:
 def _neighbours_normals(surface: Surface) -> np.ndarray:
     """The direction of the mean of each vertex's neighbours' normals, float32 [V, 3]; the vertex's own where
     they cancel."""
-    mean = (_neighbour_mean(surface) @ surface.normals).astype(np.float32)
+    mean = (neighbour_mean(len(surface.vertices_mm), surface.triangles) @ surface.normals).astype(np.float32)
     return np.where(mean.any(axis=1, keepdims=True), unit(mean), surface.normals)
 
 
-def _neighbour_mean(surface: Surface) -> scipy.sparse.csr_array:
-    """Operator [V, V] that replaces each vertex's value by the mean over its neighbours."""
-    count, triangles = len(surface.vertices_mm), surface.triangles
+def neighbour_mean(count: int, triangles: np.ndarray) -> scipy.sparse.csr_array:
+    """Operator [V, V] that replaces each vertex's value by the mean over its neighbours in ``triangles``."""
     start, end = triangles[:, [0, 1, 1, 2, 2, 0]].ravel(), triangles[:, [1, 0, 2, 1, 0, 2]].ravel()
     joined = scipy.sparse.csr_array((np.ones(len(start), np.float32), (start, end)), shape=(count, count))
     joined.data[:] = 1

@@ -75,8 +75,11 @@ def fuse_tsdf(
             _integrate(grid, face, view, origin_mm, truncation_voxels)
     if grid.hashmap().size() == 0:
         raise SequenceError(NO_DEPTH)
-    mesh = grid.extract_triangle_mesh(weight_threshold=0.5)
-    if "indices" not in mesh.triangle or len(mesh.triangle.indices) == 0:
+    try:
+        mesh = grid.extract_triangle_mesh(weight_threshold=0.5)
+    except RuntimeError:  # Open3D on a grid whose sign never changes
+        mesh = None
+    if mesh is None or "indices" not in mesh.triangle or len(mesh.triangle.indices) == 0:
         raise SequenceError(
             f"Depth gives no surface at a voxel size of {voxel_mm:g} mm; check the poses or that size."
         )

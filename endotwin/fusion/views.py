@@ -3,19 +3,14 @@
 from __future__ import annotations
 
 import logging
-from collections import deque
-from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from typing import TypeVar
 
 import numpy as np
 
+from endotwin.ahead import ahead
 from endotwin.fusion.faces import distance_mm
 from endotwin.sequence import Sequence
-
-Item = TypeVar("Item")
-Made = TypeVar("Made")
 
 logger = logging.getLogger("endotwin")
 
@@ -53,15 +48,3 @@ def read_views(sequence: Sequence, frames: Iterable[int], warn: bool = False) ->
             yield view
         elif warn:
             logger.warning("%s has no valid depth and is skipped.", sequence.depth_files[view.index])
-
-
-def ahead(make: Callable[[Item], Made], items: Iterable[Item], threads: int = 1) -> Iterator[Made]:
-    """``map(make, items)`` in order, with ``threads`` of the next results being made while one is used."""
-    with ThreadPoolExecutor(threads) as pool:
-        pending: deque = deque()
-        for item in items:
-            pending.append(pool.submit(make, item))
-            if len(pending) > threads:
-                yield pending.popleft().result()
-        while pending:
-            yield pending.popleft().result()

@@ -1,0 +1,157 @@
+"""Small holes that no depth map saw are closed from the surface around them, unless a ray passed through."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.sparse
+from scipy.sparse.linalg import spsolve
+
+from endotwin.ahead import ahead
+from endotwin.cameras import Camera
+from endotwin.fusion.agreement import Tolerance
+from endotwin.fusion.coverage import about
+from endotwin.fusion.mesh import boundary_edges, joined, surface_of
+from endotwin.fusion.smooth import neighbour_mean
+from endotwin.fusion.views import View
+from endotwin.surface import Surface
+
+LONGEST_RIM_VOXELS = 30.0
+"""A hole with a longer rim stays open: about 10 voxels across, it is no gap in the sampling."""
+
+MOST_RINGS = 5
+
+
+@dataclass(frozen=True)
+class _Caps:
+    """Vertices [N, 3] and triangles [M, 3] that close holes, numbered on from the surface's vertices, and the
+    hole of each vertex [N] and triangle [M]."""
+
+    vertices_mm: np.ndarray
+    triangles: np.ndarray
+    hole: np.ndarray
+    triangle_hole: np.ndarray
+
+
+def filled(
+    camera: Camera, surface: Surface, views: Iterable[View], tolerance: Tolerance, voxel_mm: float
+) -> Surface:
+    """``surface`` with its small holes closed and their new vertices marked ``filled``.
+
+    A cap continues the bend of the surface around it: its vertices minimise the thin-plate energy (Botsch &
+    Kobbelt 2004). Caps that hide what some view measured behind them more often than they lie at it are left
+    out.
+    """
+    rims = _rims(surface, LONGEST_RIM_VOXELS * voxel_mm)
+    if not rims:
+        return surface
+    caps = _caps(surface, rims)
+    first = len(surface.vertices_mm)
+    vertices_mm = np.concatenate([surface.vertices_mm, caps.vertices_mm])
+    triangles = np.concatenate([surface.triangles, caps.triangles])
+    vertices_mm[first:] = _faired(vertices_mm, triangles, first)
+    sound = _unpierced(camera, surface, vertices_mm[first:], caps.hole, views, tolerance)
+    triangles = np.concatenate([surface.triangles, caps.triangles[sound[caps.triangle_hole]]])
+    return surface_of(surface.origin_mm, vertices_mm, triangles, np.arange(len(vertices_mm)) >= first)
+
+
+def _rims(surface: Surface, longest_mm: float) -> list[np.ndarray]:
+    """Vertices around each hole with a rim of at most ``longest_mm``, in the direction of its triangles.
+
+    Rims that touch another are left out, and so is the outline of a loose piece: closed, it would be a
+    bubble.
+    """
+    edges = boundary_edges(surface.triangles)
+    count = len(surface.vertices_mm)
+    leaving, arriving = (np.bincount(column, minlength=count) for column in edges.T)
+    number = joined(count, edges)
+    spoilt = np.zeros(count, bool)
+    spoilt[number[(leaving != arriving) | (leaving > 1)]] = True
+    step_mm = surface.vertices_mm[edges[:, 1]] - surface.vertices_mm[edges[:, 0]]
+    length_mm = np.bincount(number[edges[:, 0]], np.linalg.norm(step_mm, axis=1), count)
+    edges = edges[~(spoilt | (length_mm > longest_mm))[number[edges[:, 0]]]]
+    following = dict(edges.tolist())
+    rims = []
+    while following:
+        start, vertex = following.popitem()
+        rim = [start]
+        while vertex != start:
+            rim.append(vertex)
+            vertex = following.pop(vertex)
+        rim = np.array(rim)
+        points = surface.vertices_mm[rim]
+        spanned = np.cross(np.roll(points, -1, axis=0) - points[0], points - points[0]).sum(axis=0)
+        if len(rim) > 2 and spanned @ surface.normals[rim].sum(axis=0) > 0:
+            rims.append(rim)
+    return rims
+
+
+def _caps(surface: Surface, rims: list[np.ndarray]) -> _Caps:
+    """Each rim closed by rings about as far apart as its vertices, and a fan about their mean."""
+    points, triangles, hole, triangle_hole = [], [], [], []
+    number = len(surface.vertices_mm)
+    for index, rim in enumerate(rims):
+        size = len(rim)
+        rings = int(np.clip(round(size / (2 * np.pi)), 1, MOST_RINGS))
+        rim_mm = surface.vertices_mm[rim]
+        share = (np.arange(1, rings) / rings)[:, None, None]
+        inner = (rim_mm + share * (rim_mm.mean(axis=0) - rim_mm)).reshape(-1, 3)
+        points += [inner, rim_mm.mean(axis=0, keepdims=True)]
+        circles = np.vstack([rim, number + np.arange(len(inner)).reshape(-1, size)])
+        centre = number + len(inner)
+        here, beside = circles, np.roll(circles, -1, axis=1)
+        band = [
+            np.stack([beside[:-1], here[:-1], here[1:]], axis=-1),
+            np.stack([beside[:-1], here[1:], beside[1:]], axis=-1),
+            np.stack([beside[-1:], here[-1:], np.full((1, size), centre)], axis=-1),
+        ]
+        band = np.concatenate([part.reshape(-1, 3) for part in band])
+        triangles.append(band)
+        triangle_hole.append(np.full(len(band), index))
+        hole.append(np.full(len(inner) + 1, index))
+        number = centre + 1
+    return _Caps(
+        np.concatenate(points).astype(np.float32),
+        np.concatenate(triangles).astype(np.int32),
+        np.concatenate(hole),
+        np.concatenate(triangle_hole),
+    )
+
+
+def _faired(vertices_mm: np.ndarray, triangles: np.ndarray, first: int) -> np.ndarray:
+    """Vertices from number ``first`` on, moved to where |Δx|² is least over them and their neighbours."""
+    laplacian = scipy.sparse.identity(len(vertices_mm), format="csr") - neighbour_mean(
+        len(vertices_mm), triangles
+    )
+    near = np.unique(triangles[(triangles >= first).any(axis=1)])
+    laplacian = laplacian[near]
+    free = laplacian[:, first:]
+    right = -free.T @ (laplacian[:, :first] @ vertices_mm[:first].astype(np.float64))
+    return spsolve((free.T @ free).tocsc(), right).reshape(-1, 3)
+
+
+def _unpierced(
+    camera: Camera,
+    surface: Surface,
+    points_mm: np.ndarray,
+    hole: np.ndarray,
+    views: Iterable[View],
+    tolerance: Tolerance,
+) -> np.ndarray:
+    """Bool [holes]: no more often in front of what was measured than at it, of local ``points_mm`` [N, 3]."""
+
+    def votes(view: View) -> np.ndarray:
+        T_local_camera = surface.to_local(view.T_world_camera).astype(np.float32)
+        ray_mm = points_mm - T_local_camera[:3, 3]
+        uv = camera.project(ray_mm @ T_local_camera[:3, :3])
+        with np.errstate(invalid="ignore"):
+            inside = ((uv >= 0) & (uv <= (camera.width - 1, camera.height - 1))).all(axis=1)
+        distance_mm = np.linalg.norm(ray_mm[inside], axis=1)
+        nearest_mm, farthest_mm = about(view.distance_mm, uv[inside])
+        before = distance_mm < nearest_mm - tolerance.at(nearest_mm)
+        at = ~before & (distance_mm <= farthest_mm + tolerance.at(farthest_mm))
+        return np.bincount(hole[inside], at.astype(int) - before.astype(int), hole[-1] + 1)
+
+    return sum(ahead(votes, views, threads=2)) >= 0
