@@ -1,7 +1,8 @@
 """What endotwin's accuracy costs: run the pipeline on sequences with truth and print a markdown table.
 
     python benchmarks/benchmark.py DATA/colon_direct
-    python benchmarks/benchmark.py DATA/colon_direct --method twin --method endopbr --budget 60
+    python benchmarks/benchmark.py DATA/colon_direct --config draft --config fine
+    python benchmarks/benchmark.py DATA/colon_direct --method endopbr --budget 60s
 
 Each command runs in its own process from cold files, so that its seconds and its peak memory are its own.
 Only this script reads the truth (``truth/``: albedo and roughness of some frames; ``made.json``: the light).
@@ -13,6 +14,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from itertools import product
 from pathlib import Path
 
 import cv2
@@ -82,22 +84,26 @@ def percent(value: float, true: float) -> str:
     return f"{100 * (value / true - 1):+.1f} %"
 
 
-def benchmark(sequence: Path, method: str, options: argparse.Namespace, work: Path) -> dict[str, str]:
+def benchmark(
+    sequence: Path, method: str, config: str, options: argparse.Namespace, work: Path
+) -> dict[str, str]:
     """One row of the table."""
-    twin_folder, profile = work / f"{sequence.name}-{method}", work / "profile.json"
-    protocol = ["--scale", options.scale, "--geometry", options.geometry]
-    _, fuse_s, fuse = run("fuse", sequence, "-o", twin_folder, "--overwrite", *protocol, profile=profile)
+    twin_folder, profile = work / f"{sequence.name}-{method}-{Path(config).stem}", work / "profile.json"
+    protocol = ["--config", config, "--geometry", options.geometry]
+    scale = [] if options.scale is None else ["--scale", options.scale]
     budget = [] if options.budget is None else ["--budget", options.budget]
-    _, fit_s, fit = run(
-        "fit", twin_folder, "--method", method, *budget, "--seed", options.seed, profile=profile
+    _, fuse_s, fuse = run(
+        "fuse", sequence, "-o", twin_folder, "--overwrite", *protocol, *scale, profile=profile
     )
-    printed, eval_s, _ = run("eval", twin_folder, "--json", profile=profile)
+    learn = ["--method", method, "--config", config, *budget, "--seed", options.seed]
+    _, fit_s, fit = run("fit", twin_folder, *learn, profile=profile)
+    printed, eval_s, _ = run("eval", twin_folder, "--json", "--scale", 1, profile=profile)
     scores, twin = json.loads(printed), Twin.load(twin_folder)
     albedo, roughness = material_errors(twin, sequence / "truth")
     true = true_light(json.loads((sequence / "truth" / "made.json").read_text()))
     return {
         "sequence": sequence.name,
-        "method": method if options.budget is None else f"{method}, {options.budget:g} s",
+        "method": ", ".join(filter(None, [method, config if method == "twin" else None, options.budget])),
         "geometry": options.geometry,
         "fuse": f"{fuse_s:.1f} s",
         "fit": f"{fit_s:.1f} s",
@@ -123,9 +129,10 @@ def main() -> None:
     )
     parser.add_argument("sequence", nargs="+", type=Path, help="sequence folders with a truth/ folder")
     parser.add_argument("--method", action="append", choices=METHODS, help="may be repeated (default: twin)")
-    parser.add_argument("--budget", type=float, help="seconds of each fit (default: the method's own)")
+    parser.add_argument("--config", action="append", help="may be repeated (default: standard)")
+    parser.add_argument("--budget", help="time of each fit, as 60s or 10m (default: the config's)")
     parser.add_argument("--geometry", default="known", choices=("known", "heldout"))
-    parser.add_argument("--scale", type=float, default=1.0, help="factor on the image size")
+    parser.add_argument("--scale", type=float, help="factor on the image size (default: the config's)")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--keep", type=Path, metavar="FOLDER", help="keep the twins there")
     options = parser.parse_args()
@@ -134,8 +141,9 @@ def main() -> None:
         work.mkdir(parents=True, exist_ok=True)
         header_printed = False
         for sequence in options.sequence:
-            for method in options.method or ["twin"]:
-                row = benchmark(sequence, method, options, work)
+            ways = product(options.method or ["twin"], options.config or ["standard"])
+            for method, config in ways:
+                row = benchmark(sequence, method, config, options, work)
                 if not header_printed:
                     print("| " + " | ".join(row) + " |\n|" + "---|" * len(row), flush=True)
                     header_printed = True

@@ -1,0 +1,6 @@
+"""What accuracy costs in time, for one's own sequence: a ladder of runs, their Pareto front and its knee."""
+
+from endotwin.tradeoff.ladder import LADDER, Rung, ladder
+from endotwin.tradeoff.run import tradeoff
+
+__all__ = ["LADDER", "Rung", "ladder", "tradeoff"]

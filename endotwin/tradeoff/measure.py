@@ -1,0 +1,105 @@
+"""One measurement: the real commands, each in a process of its own, from cold files."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+from endotwin.errors import EndotwinError
+from endotwin.output import whole_file
+
+SCORES = ("psnr", "ssim", "lpips", "psnr_covered", "covered")
+
+
+class RungError(EndotwinError):
+    """A rung's command failed."""
+
+
+def cool(files: Iterable[Path]) -> None:
+    """Drop ``files`` from the page cache, so that they are read from the disk again; Linux only."""
+    if not hasattr(os, "posix_fadvise"):
+        return
+    for file in files:
+        descriptor = os.open(file, os.O_RDONLY)
+        os.posix_fadvise(descriptor, 0, 0, os.POSIX_FADV_DONTNEED)
+        os.close(descriptor)
+
+
+def timed(arguments: list[str], files: Iterable[Path], work: Path) -> tuple[str, dict]:
+    """Run one endotwin command in ``work``, with ``files`` cold: what it printed, and its cost.
+
+    Returns:
+        stdout; ``{"seconds": wall-clock with Python's start, "stages", "parts", "peak_memory_mb"}``.
+
+    Raises:
+        RungError: the command failed; says what it said.
+    """
+    profile = work / "profile.json"
+    cool(files)
+    command = [sys.executable, "-m", "endotwin.cli.main", *arguments, "--profile", str(profile)]
+    started = time.perf_counter()
+    done = subprocess.run(command, cwd=work, capture_output=True, text=True, encoding="utf-8")
+    seconds = time.perf_counter() - started
+    if done.returncode:
+        said = done.stderr.strip().splitlines() or ["nothing"]
+        raise RungError(f"endotwin {' '.join(arguments)} failed and said: {said[-1]}")
+    return done.stdout, {**json.loads(profile.read_text()), "seconds": seconds}
+
+
+def measured(commands: list[list[str]], files: Sequence[Path], work: Path) -> dict:
+    """Fuse, fit and score one twin of the sequence with ``files``, in ``work``/twin, which is left there.
+
+    Returns:
+        ``{"seconds": of fuse and fit, "stages": {stage: s}, "peak_memory_mb", scores..., "load": before}``.
+    """
+    shutil.rmtree(work / "twin", ignore_errors=True)
+    load = os.getloadavg()[0] if hasattr(os, "getloadavg") else None
+    _, fuse = timed(commands[0], files, work)
+    _, fit = timed(commands[1], files, work)
+    printed, _ = timed(commands[2], files, work)
+    scores = json.loads(printed)
+    return {
+        "seconds": fuse["seconds"] + fit["seconds"],
+        "stages": stages(fuse, fit),
+        "peak_memory_mb": max(fuse["peak_memory_mb"], fit["peak_memory_mb"]),
+        **{name: scores[name] for name in SCORES},
+        "load": load,
+    }
+
+
+def stages(*profiles: dict) -> dict[str, float]:
+    """Seconds of the parts of fuse and fit; what belongs to none (imports, files) is ``start``-up.
+
+    A part that is done again adds to its first.
+    """
+    shares: dict[str, float] = {"start-up and files": 0.0}
+    for profile in profiles:
+        inside = 0.0
+        for name, seconds in profile["parts"].get(profile["command"], {}).items():
+            known = STAGES.get(name.removesuffix(" again"), name.removesuffix(" again"))
+            shares[known] = shares.get(known, 0.0) + seconds
+            inside += seconds
+        shares["start-up and files"] += max(0.0, profile["seconds"] - inside)
+    return shares
+
+
+STAGES = {
+    "import": "start-up and files",
+    "open": "start-up and files",
+    "voxel size": "TSDF",
+    "noise": "TSDF",
+    "start": "closed form",
+}
+"""Parts that go under another name in the plot."""
+
+
+def keep(result: dict, path: Path) -> None:
+    """Write one measurement whole or not at all."""
+    with whole_file(path, overwrite=True) as file:
+        file.write_text(json.dumps(result, indent=1) + "\n")

@@ -1,0 +1,43 @@
+"""What the any-time fit allows itself, by the clock."""
+
+import time
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from endotwin.config import FitConfig
+from endotwin.fit.pace import Pace, spread_order
+
+
+@given(st.integers(1, 300))
+def test_every_beginning_of_the_spread_order_is_evenly_spread(count):
+    order = spread_order(count)
+    assert sorted(order) == list(range(count))
+    for some in (2, 4, 8, 16):
+        if some < count:
+            places = np.sort(order[:some])
+            gaps = np.diff([*places, count])
+            assert gaps.max() <= 2 * count / some + 1
+
+
+def test_without_a_budget_everything_is_done_in_order():
+    pace = Pace(FitConfig(pixels=1000))
+    assert list(pace.photos([5, 3, 8])) == [5, 3, 8]
+    assert pace.pixels == pace.start_pixels == 1000
+    assert pace.share(frames=10, pixels=400) == pytest.approx(0.25)
+    assert not pace.out_of_time() and not pace.light_is_over()
+
+
+def test_a_budget_that_is_spent_still_reads_one_photo_and_then_nothing():
+    pace = Pace(FitConfig(budget=1e-3))
+    time.sleep(2e-3)
+    assert len(list(pace.photos(list(range(50))))) == 1
+    assert pace.out_of_time() and pace.light_is_over() and pace.left() == 0
+
+
+def test_pixels_grow_with_the_budget_up_to_those_of_the_plan():
+    pixels = [Pace(FitConfig(budget=budget)).pixels for budget in (1, 5, 20, 1000)]
+    assert pixels == sorted(pixels) and pixels[0] < pixels[1] < pixels[2] <= pixels[3] == FitConfig().pixels
+    assert Pace(FitConfig(pixels=700, budget=1000)).pixels == 700
