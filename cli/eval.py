@@ -11,7 +11,7 @@ import typer
 from endotwin.cli import console
 
 from endotwin.errors import OutputError
-from endotwin.output import check_free
+from endotwin.output import check_picture
 
 if TYPE_CHECKING:
     from endotwin.twin import Twin
@@ -30,35 +30,40 @@ def evaluate(
             metavar="FILE.png", help="Write a picture: photo, render and error of each held-out frame."
         ),
     ] = None,
+    scale: Annotated[
+        float | None,
+        typer.Option(
+            metavar="FACTOR",
+            help="Compare at this factor of the photos' size, at most 1.",
+            show_default="the twin's own",
+        ),
+    ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the picture of --sheet.")] = False,
     profile: console.Profile = None,
 ) -> None:
     """Score a fitted TWIN on the frames held out of the fit: every 8th, from the first.
 
-    PSNR, SSIM and, with the extra 'lpips', LPIPS: over all pixels with depth, and over those whose surface
-    a training photo saw ("covered"). The scores are kept in the twin.
+    PSNR, SSIM and, with the extra 'lpips', LPIPS: over the pixels with depth inside the lens circle, and over
+    those whose surface a training photo saw ("covered"). The scores are kept in the twin.
 
     Example: endotwin eval twin --sheet sheet.png
     """
     if sheet is not None:
-        check_free(sheet, overwrite)
+        check_picture(sheet, overwrite)
     with console.command("eval", profile) as run:
         with run.stage("import"):
             from endotwin.evaluation import evaluate
             from endotwin.twin import Twin
-        twin = Twin.load(twin_folder)
+        with run.stage("load"):
+            twin = Twin.load(twin_folder)
         with run.stage("eval"):
-            evaluation = evaluate(twin, sheet, run.progress)
+            scored = twin if scale is None else twin.at_scale(scale)
+            evaluation = evaluate(scored, sheet, run.progress, overwrite)
+        print(json_format.dumps(evaluation.to_dict()) if json else evaluation)
         with run.stage("write"):
             kept = _keep(twin.with_record(eval=evaluation.to_dict()), twin_folder)
-    if json:
-        print(json_format.dumps(evaluation.to_dict()))
-        return
-    print(evaluation)
-    written = [f"the scores to {twin_folder}"] * kept + [f"the contact sheet to {sheet}"] * (
-        sheet is not None
-    )
-    if written:
+    written = [f"the scores to {twin_folder}"] * kept + [f"the contact sheet to {sheet}"] * bool(sheet)
+    if written and not json:
         print("wrote", " and ".join(written))
 
 

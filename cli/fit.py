@@ -8,22 +8,36 @@ from typing import Annotated
 import typer
 from endotwin.cli import console
 
+from endotwin.config import DEFAULT, load_config, seconds
+from endotwin.effects import parse_states
 from endotwin.errors import OutputError
-from endotwin.output import check_free
+from endotwin.output import TWIN, check_free
+
+AROUND = 0.5
+"""Python's start before the stopwatch's and its end after it, in shares of the time that the imports took."""
+
+LEAST_S = 0.1
+"""A budget already spent on the start still asks for the least that a fit can be."""
 
 
 def fit(
     twin_folder: console.TwinFolder,
     method: Annotated[
-        str,
+        str | None,
         typer.Option(
             metavar="twin|endopbr",
             help="twin: endotwin's own. endopbr: Han & Wu 2025 as published; slow without a GPU.",
+            show_default="twin",
         ),
-    ] = "twin",
+    ] = None,
+    config: console.Config = DEFAULT,
     budget: Annotated[
-        float | None,
-        typer.Option(metavar="SECONDS", help="Stop after this time.", show_default="the method's own"),
+        str | None,
+        typer.Option(
+            metavar="TIME",
+            help="Give the best twin of this time: 10, 10s or 2m, of the whole command.",
+            show_default="the method's own",
+        ),
     ] = None,
     epochs: Annotated[
         int | None,
@@ -31,7 +45,15 @@ def fit(
             metavar="N", help="Passes over the training photos (endopbr).", show_default="the method's own"
         ),
     ] = None,
-    seed: Annotated[int, typer.Option(metavar="N", help="Seed of all random choices.")] = 0,
+    effects: Annotated[
+        str,
+        typer.Option(
+            metavar="NAME=STATE,…",
+            help="auto, on or off by name, as in shadows=off,gain=on; auto unless named here or in the config.",
+            show_default=False,
+        ),
+    ] = "",
+    seed: Annotated[int, typer.Option(metavar="N", min=0, help="Seed of all random choices.")] = 0,
     output: Annotated[
         Path | None,
         typer.Option(
@@ -43,20 +65,41 @@ def fit(
 ) -> None:
     """Fit base colour, roughness, metallic, the light and the camera response to TWIN's training photos.
 
-    Example: endotwin fit twin --budget 60
+    A stopped fit with --method endopbr goes on when the same command is given again.
+
+    Example: endotwin fit twin --budget 60s
     """
     if output is not None:
-        check_free(output, overwrite)
+        check_free(output, overwrite, TWIN)
+    target = (output or twin_folder).absolute()
+    settings = load_config(config)
+    plan, states = settings.fit, {**settings.effects, **parse_states(effects)}
+    budget_s = plan.budget if budget is None else seconds(budget)
     with console.command("fit", profile) as run:
         with run.stage("import"):
             from endotwin.pipeline import fit_twin
             from endotwin.twin import Twin
-        twin = Twin.load(twin_folder)
+        with run.stage("load"):
+            twin = Twin.load(twin_folder)
         if output is None and twin.fitted and not overwrite:
             raise OutputError(f"{twin_folder} is fitted already; pass --overwrite, or -o OTHER to keep it")
+        if budget_s is not None:
+            budget_s = max(LEAST_S, budget_s - run.stopwatch.total - AROUND * run.stopwatch.seconds["import"])
         with run.stage("fit"):
-            twin = fit_twin(twin, method, budget_s=budget, epochs=epochs, seed=seed, progress=run.progress)
+            twin = fit_twin(
+                twin,
+                method,
+                budget_s=budget_s,
+                epochs=epochs,
+                seed=seed,
+                config=plan,
+                effects=states,
+                progress=run.progress,
+                checkpoint=target.with_name(f".{target.name}.fit"),
+            )
+        run.stopwatch.parts["fit"] = twin.record["fit"]["stages"]
         with run.stage("write"):
-            twin.save(output or twin_folder, overwrite=True)
+            twin.save(target, overwrite=True)
     light = f"L0 {twin.light.L0:.4g}, n {twin.light.n:.3f}, q {twin.light.q:.3f}"
-    print(f"wrote {output or twin_folder}: {light}, γ {twin.response.gamma:.4f}")
+    extra = ", ".join(name for name in twin.effects if name != "specular") or "none"
+    print(f"wrote {output or twin_folder}: {light}, γ {twin.response.gamma:.4f}, effects: {extra}")

@@ -8,7 +8,8 @@ from typing import Annotated
 import typer
 from endotwin.cli import console
 
-from endotwin.output import check_free
+from endotwin.config import DEFAULT, load_config
+from endotwin.output import TWIN, check_free
 
 
 def fuse(
@@ -26,11 +27,22 @@ def fuse(
     ],
     format: Annotated[
         str | None,
-        typer.Option(metavar="NAME", help="c3vd, transforms, simcol or tum.", show_default="detected"),
+        typer.Option(
+            metavar="NAME",
+            help="Layout of SEQUENCE: c3vd (pose.txt), transforms (nerfstudio or instant-ngp), simcol "
+            "(SimCol3D) or tum (TUM RGB-D).",
+            show_default="detected",
+        ),
     ] = None,
+    config: console.Config = DEFAULT,
     scale: Annotated[
-        float, typer.Option(metavar="FACTOR", help="Work at this factor of the image size.")
-    ] = 1.0,
+        float | None,
+        typer.Option(
+            metavar="FACTOR",
+            help="Work at this factor of the image size, at most 1.",
+            show_default="the config's",
+        ),
+    ] = None,
     voxel: Annotated[
         float | None,
         typer.Option(
@@ -41,7 +53,8 @@ def fuse(
         str,
         typer.Option(
             metavar="known|heldout",
-            help="known: fuse held-out frames' depth too. heldout: do not. Their photos are never used.",
+            help="Every 8th frame is held out: its photo is never fitted, and 'endotwin eval' scores by it. "
+            "known: its depth is fused all the same. heldout: its depth is left out too.",
         ),
     ] = "known",
     overwrite: console.Overwrite = False,
@@ -51,14 +64,22 @@ def fuse(
 
     Example: endotwin fuse examples/colon_small -o twin
     """
-    check_free(output, overwrite)
+    check_free(output, overwrite, TWIN)
+    plan = load_config(config).fuse
     with console.command("fuse", profile) as run:
         with run.stage("import"):
             from endotwin.pipeline import fuse_twin
         with run.stage("fuse"):
             twin = fuse_twin(
-                sequence, format=format, scale=scale, geometry=geometry, voxel_mm=voxel, progress=run.progress
+                sequence,
+                format=format,
+                scale=scale,
+                geometry=geometry,
+                voxel_mm=voxel,
+                config=plan,
+                progress=run.progress,
             )
+        run.stopwatch.parts["fuse"] = twin.record["fuse"]["stages"]
         with run.stage("write"):
             twin.save(output, overwrite)
     surface = twin.surface

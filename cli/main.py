@@ -2,22 +2,25 @@
 
 from __future__ import annotations
 
-import signal
 import sys
 from typing import Annotated
 
 import typer
+from endotwin.cli.check import check
+from endotwin.cli.effects import effects
 from endotwin.cli.eval import evaluate
 from endotwin.cli.fit import fit
 from endotwin.cli.fuse import fuse
 from endotwin.cli.inspect import inspect
+from endotwin.cli.selfcheck import selfcheck
+from endotwin.cli.stop import Stopped, heed_signals
 from endotwin.cli.synth import synth
+from endotwin.cli.tradeoff import tradeoff
 
 from endotwin.errors import EndotwinError
 
 app = typer.Typer(
     name="endotwin",
-    no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
@@ -28,16 +31,15 @@ for name, function in {
     "eval": evaluate,
     "synth": synth,
     "inspect": inspect,
+    "effects": effects,
+    "check": check,
+    "selfcheck": selfcheck,
+    "tradeoff": tradeoff,
 }.items():
     app.command(name)(function)
 
-
-class Stopped(BaseException):
-    """The user, or the system, asked the command to stop."""
-
-
-def _stop(number: int, _frame) -> None:
-    raise Stopped(number)
+(USAGE_ERRORS,) = typer.BadParameter.__bases__
+"""Of any option: unknown, missing, of a wrong type or out of its range."""
 
 
 def _show_version(wanted: bool) -> None:
@@ -61,12 +63,20 @@ def describe(
     """
 
 
+def _usage(error: typer.BadParameter) -> str:
+    """What is wrong with the command line, and where its options are explained."""
+    command = error.ctx.command_path if error.ctx else "endotwin"
+    return f"{error.format_message().rstrip('.')}; see '{command} --help'"
+
+
 def main() -> None:
     """Run the command line; exit code 2 and one line on stderr for every error that a user can mend."""
-    signal.signal(signal.SIGINT, _stop)
-    signal.signal(signal.SIGTERM, _stop)
+    heed_signals()
     try:
-        app()
+        sys.exit(app(sys.argv[1:] or ["--help"], standalone_mode=False))
+    except USAGE_ERRORS as error:
+        print("error:", _usage(error), file=sys.stderr)
+        sys.exit(2)
     except EndotwinError as error:
         print("error:", " ".join(str(error).split()), file=sys.stderr)
         sys.exit(2)
@@ -77,7 +87,7 @@ def main() -> None:
         )
         sys.exit(2)
     except Stopped as stopped:
-        print("stopped; nothing was written", file=sys.stderr)
+        print("stopped;", *getattr(stopped, "__notes__", ["nothing was written"]), file=sys.stderr)
         sys.exit(128 + stopped.args[0])
 
 

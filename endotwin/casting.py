@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from copy import copy
 from dataclasses import dataclass
 
 import numpy as np
@@ -64,6 +65,12 @@ class Caster:
         self._threads = threads
         self._scene = rtcore_scene.EmbreeScene(robust=True)
         self._mesh = TriangleMesh(self._scene, surface.vertices_mm[surface.triangles])
+
+    def threaded(self, threads: int) -> Caster:
+        """The same scene, cast into by so many threads."""
+        other = copy(self)
+        other._threads = threads
+        return other
 
     def cast_rays(
         self, origins: np.ndarray, directions: np.ndarray

@@ -25,7 +25,7 @@ import numpy as np
 from endotwin import metrics
 from endotwin.casting import Correspondences
 from endotwin.errors import TwinError
-from endotwin.output import whole_file
+from endotwin.output import check_picture, whole_file
 from endotwin.render import Renderer
 from endotwin.sequence import Frame
 from endotwin.surface import Surface
@@ -37,6 +37,9 @@ Progress = Callable[[str, int, int], None]
 
 SHEET_WIDTH = 320
 """Width in pixels of one picture of the contact sheet."""
+
+POOR_DB = 20.0
+"""A twin with a lower PSNR does not look like its photos."""
 
 ERROR_FULL_SCALE = 0.25
 """Absolute display-value error that the contact sheet draws in its brightest colour."""
@@ -170,7 +173,7 @@ class _HeldOut:
 def _held_out(twin: Twin, progress: Progress | None) -> Iterator[_HeldOut]:
     """Each held-out frame with a valid pixel, rendered; the others are skipped with a warning."""
     renderer = Renderer(twin)
-    sequence = twin.source.open()
+    sequence = twin.sequence()
     indices = twin.source.heldout(len(sequence))
     for done, index in enumerate(indices):
         if progress:
@@ -180,7 +183,7 @@ def _held_out(twin: Twin, progress: Progress | None) -> Iterator[_HeldOut]:
         if not valid.any():
             logger.warning("Held-out frame %s has no valid pixel and is not scored.", frame.name)
             continue
-        view = renderer.view(frame.T_world_camera, valid)
+        view = renderer.view(frame.T_world_camera, valid, twin.exposure(index))
         covered = covered_pixels(view.hits, twin.surface, valid.shape)
         yield _HeldOut(frame, frame.color.astype(np.float32) / 255, view.color, valid, covered)
     if progress:
@@ -206,17 +209,23 @@ def _score(held_out: _HeldOut) -> FrameScore:
     )
 
 
-def evaluate(twin: Twin, sheet: Path | None = None, progress: Progress | None = None) -> Evaluation:
+def evaluate(
+    twin: Twin, sheet: Path | None = None, progress: Progress | None = None, overwrite: bool = False
+) -> Evaluation:
     """Score a fitted twin on the frames that were held out of its fit.
 
     Args:
-        sheet: where to write a contact sheet, one row photo | render | error a frame; replaces what is there.
+        sheet: PNG file to write a contact sheet to, one row photo | render | error a frame.
         progress: called with (label, done, total).
+        overwrite: whether ``sheet`` may exist.
 
     Raises:
         TwinError: the twin is not fitted, or no held-out frame has a valid pixel.
         SequenceError: the twin's sequence has moved.
+        OutputError: ``sheet`` exists or cannot be written.
     """
+    if sheet is not None:
+        check_picture(sheet, overwrite)
     scores, rows = [], []
     for held_out in _held_out(twin, progress):
         scores.append(_score(held_out))
@@ -227,8 +236,14 @@ def evaluate(twin: Twin, sheet: Path | None = None, progress: Progress | None = 
             f"{twin.source.path} has no held-out frame to score; fuse a sequence of two or more frames"
         )
     if sheet is not None:
-        _write_sheet(rows, sheet)
-    return Evaluation(tuple(scores), twin.response.gamma, twin.light, twin.source.geometry)
+        _write_sheet(rows, sheet, overwrite)
+    evaluation = Evaluation(tuple(scores), twin.response.gamma, twin.light, twin.source.geometry)
+    if evaluation.psnr < POOR_DB:
+        logger.warning(
+            "the twin does not look like its photos (%.1f dB); 'endotwin check %s' looks for the cause",
+            *(evaluation.psnr, twin.source.path),
+        )
+    return evaluation
 
 
 def _sheet_row(held_out: _HeldOut, score: FrameScore) -> np.ndarray:
@@ -255,6 +270,6 @@ def _labelled(picture: np.ndarray, label: str) -> np.ndarray:
     return small
 
 
-def _write_sheet(rows: list[np.ndarray], path: Path) -> None:
-    with whole_file(path, overwrite=True) as file:
+def _write_sheet(rows: list[np.ndarray], path: Path, overwrite: bool) -> None:
+    with whole_file(path, overwrite) as file:
         file.write_bytes(cv2.imencode(".png", np.vstack(rows))[1].tobytes())

@@ -27,8 +27,6 @@ HASH_ORIGIN = -100_003
 it corners
 collide with their mirror images, since in two's complement −a ^ −b = a ^ b for odd a and b."""
 
-CORNERS = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)])
-
 
 @dataclass(frozen=True)
 class HashGrid:
@@ -63,13 +61,15 @@ def corner_slots(points_mm: np.ndarray, cell_mm: float, log2_slots: int) -> tupl
     Returns:
         slot int64 [V, 8], below 2**log2_slots; weight float64 [V, 8], non-negative, summing to 1.
     """
-    scaled = np.asarray(points_mm, np.float64) / cell_mm
-    base = np.floor(scaled).astype(np.int64)
-    inside = (scaled - base)[:, None, :]
-    weight = np.where(CORNERS, inside, 1 - inside).prod(axis=2)
-    corner = base[:, None, :] + CORNERS - HASH_ORIGIN
-    mixed = corner[..., 0] * PRIMES[0] ^ corner[..., 1] * PRIMES[1] ^ corner[..., 2] * PRIMES[2]
-    return mixed & ((1 << log2_slots) - 1), weight
+    scaled = np.asarray(points_mm, np.float64).T / cell_mm
+    base = np.floor(scaled)
+    inside = scaled - base
+    low = base.astype(np.int64) - HASH_ORIGIN
+    x, y, z = (np.stack([c * prime, (c + 1) * prime], axis=1) for c, prime in zip(low, PRIMES, strict=True))
+    mixed = (x[:, :, None, None] ^ y[:, None, :, None]) ^ z[:, None, None, :]
+    x, y, z = (np.stack([1 - t, t], axis=1) for t in inside)
+    weight = (x[:, :, None, None] * y[:, None, :, None]) * z[:, None, None, :]
+    return mixed.reshape(-1, 8) & ((1 << log2_slots) - 1), weight.reshape(-1, 8)
 
 
 @dataclass(frozen=True)
@@ -88,6 +88,7 @@ class HashOperator:
     level: np.ndarray
     slot: np.ndarray
     cells_mm: np.ndarray
+    log2_slots: int
 
     @classmethod
     def of(cls, points_mm: np.ndarray, grid: HashGrid) -> HashOperator:
@@ -109,23 +110,36 @@ class HashOperator:
             (weights.ravel().astype(np.float32), columns.ravel(), starts), (len(points_mm), rows)
         )
         return cls(
-            to_torch(matrix), to_torch(matrix.T), np.concatenate(level), np.concatenate(slots), grid.cells_mm
+            to_torch(matrix),
+            to_torch(matrix.T),
+            np.concatenate(level),
+            np.concatenate(slots),
+            grid.cells_mm,
+            grid.log2_slots,
         )
+
+    @classmethod
+    def each(cls, count: int, cell_mm: float) -> HashOperator:
+        """The identity: each of ``count`` points has a row of its own, as in a cell of edge ``cell_mm``."""
+        one = to_torch(scipy.sparse.identity(count, np.float32, "csr"))
+        return cls(one, one, np.zeros(count, np.int64), np.arange(count), np.array([cell_mm]), 0)
 
     def __call__(self, table: Tensor) -> Tensor:
         """Features [V, C] = A·table [R, C], differentiable; the gradient is Aᵀ·g."""
         return _Apply.apply(table, self)
 
-    def adopt(self, table: Tensor, other: HashOperator) -> Tensor:
-        """The entries of ``other``'s table [R', C] in this operator's rows [R, C]; 0 where ``other`` has
-        none.
-        """
-        stride = 1 + max(int(self.slot.max()), int(other.slot.max()))
-        mine, theirs = self.level * stride + self.slot, other.level * stride + other.slot
-        _, here, there = np.intersect1d(mine, theirs, assume_unique=True, return_indices=True)
-        adopted = torch.zeros(len(mine), table.shape[1], dtype=table.dtype)
-        adopted[torch.from_numpy(here)] = table[torch.from_numpy(there)]
-        return adopted
+    def at(self, points_mm: np.ndarray, table: Tensor) -> Tensor:
+        """Features [V, C] of ``table`` [R, C] at other points [V, 3]; a slot that has no row counts as 0."""
+        features = torch.zeros(len(points_mm), table.shape[1])
+        for number, cell_mm in enumerate(self.cells_mm):
+            rows = np.flatnonzero(self.level == number)
+            dense = torch.zeros(1 << self.log2_slots, table.shape[1])
+            dense[torch.from_numpy(self.slot[rows])] = table[torch.from_numpy(rows)]
+            slot, weight = corner_slots(points_mm, cell_mm, self.log2_slots)
+            features += torch.nn.functional.embedding_bag(
+                torch.from_numpy(slot), dense, mode="sum", per_sample_weights=torch.from_numpy(weight).float()
+            )
+        return features
 
 
 class _Apply(torch.autograd.Function):

@@ -49,7 +49,8 @@ def incidence(
     hits: Correspondences, surface: Surface, camera: Camera, T_world_camera: np.ndarray
 ) -> Incidence:
     """Incidence at ``hits`` of the view from pose ``T_world_camera`` [4, 4], with the light at the lens."""
-    return incidence_on(to_camera(hits.interpolate(surface, surface.normals), T_world_camera), hits, camera)
+    normals = to_camera(hits.interpolate(surface, surface.normals), T_world_camera)
+    return incidence_on(normals, hits, camera.pixel_directions)
 
 
 def to_camera(normals: np.ndarray, T_world_camera: np.ndarray) -> np.ndarray:
@@ -57,9 +58,10 @@ def to_camera(normals: np.ndarray, T_world_camera: np.ndarray) -> np.ndarray:
     return unit(normals @ T_world_camera[:3, :3].astype(normals.dtype))
 
 
-def incidence_on(normals: np.ndarray, hits: Correspondences, camera: Camera) -> Incidence:
-    """Incidence at ``hits`` with unit ``normals``, float32 [N, 3], in the camera frame, light at the lens."""
-    view = camera.pixel_directions.reshape(-1, 3).take(hits.pixel, axis=0)
+def incidence_on(normals: np.ndarray, hits: Correspondences, directions: np.ndarray) -> Incidence:
+    """Incidence at ``hits`` with unit ``normals`` [N, 3], seen along unit ``directions`` [..., 3] of all
+    pixels, both float32 in the camera frame, light at the lens."""
+    view = directions.reshape(-1, 3).take(hits.pixel, axis=0)
     cos = -dot(normals, view)
     # |n × ω|² = |n − cos·ω|² with ω = −view, without the cancellation of 1 − cos².
     tangential = normals + cos[:, None] * view

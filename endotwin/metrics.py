@@ -18,6 +18,8 @@ def psnr(reference: np.ndarray, image: np.ndarray, mask: np.ndarray) -> float:
     """
     if not mask.any():
         return float("nan")
+    if np.array_equal(reference[mask], image[mask]):
+        return float("inf")
     return float(peak_signal_noise_ratio(reference[mask], image[mask], data_range=1))
 
 

@@ -2,20 +2,27 @@
 
 from __future__ import annotations
 
+import logging
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import asdict, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from endotwin import fusion
+from endotwin.cameras import read_camera
+from endotwin.config import STANDARD, FitConfig, FuseConfig
 from endotwin.errors import OptionError, SequenceError
-from endotwin.fit import FitOptions, fit
+from endotwin.fit import fit
 from endotwin.readers import open_sequence
 from endotwin.stopwatch import Stopwatch
-from endotwin.synth import Summary, parse_light_edit, parse_material_edit, parse_trajectory
-from endotwin.synth.dataset import synthesize as render_dataset
 from endotwin.twin import Source, Twin
 
+if TYPE_CHECKING:
+    from endotwin.synth import Job, Limits, Summary
+
 GEOMETRIES = ("known", "heldout")
+
+logger = logging.getLogger("endotwin")
 
 Progress = Callable[[str, int, int], None]
 
@@ -24,9 +31,10 @@ def fuse_twin(
     path: Path | str,
     *,
     format: str | None = None,
-    scale: float = 1.0,
+    scale: float | None = None,
     geometry: str = "known",
     voxel_mm: float | None = None,
+    config: FuseConfig = STANDARD.fuse,
     progress: Progress | None = None,
 ) -> Twin:
     """Fuse the depth maps of a sequence into a twin that has a surface and no materials yet.
@@ -34,10 +42,11 @@ def fuse_twin(
     Args:
         path: the sequence's folder or ``transforms.json``.
         format: its reader; detected unless given.
-        scale: factor on the image size.
+        scale: factor on the image size; the config's unless given.
         geometry: ``known`` fuses the depth of every frame (Han & Wu's protocol); ``heldout`` leaves out the
             depth of the held-out frames too. Neither uses their photos.
-        voxel_mm: voxel edge; chosen from the depth footprint unless given.
+        voxel_mm: voxel edge; chosen from the depth footprint, times the config's factor, unless given.
+        config: how finely to fuse.
         progress: called with (label, done, total).
 
     Raises:
@@ -46,39 +55,60 @@ def fuse_twin(
     """
     if geometry not in GEOMETRIES:
         raise OptionError(f"geometry {geometry!r} is unknown; choose one of {', '.join(GEOMETRIES)}")
+    scale = config.scale if scale is None else scale
     _check_positive("scale", scale)
     if voxel_mm is not None:
         _check_positive("voxel size", voxel_mm)
     stopwatch = Stopwatch()
     with stopwatch.stage("open"):
         sequence = open_sequence(Path(path), format=format, scale=scale)
-    source = Source(str(Path(path).resolve()), sequence.format, scale, geometry)
+    source = Source(str(Path(path).resolve()), sequence.format, scale, geometry, frames=config.frames)
     training = source.training(len(sequence))
     if not training:
         raise SequenceError(f"{path} has no frame to fit: every one is held out; use more frames")
-    frames = range(len(sequence)) if geometry == "known" else training
-    with stopwatch.stage("fuse"):
-        surface = fusion.fuse(sequence, frames, training, voxel_mm, progress)
-    record = {"fuse": {"frames": len(frames), "voxel_mm": voxel_mm, **stopwatch.to_dict()}}
-    return Twin(surface, sequence.camera, source, record=record)
+    heldout = source.heldout(len(sequence)) if geometry == "known" else []
+    frames = sorted({*training, *heldout})
+
+    def report(stage: str, done: int, total: int) -> None:
+        stopwatch.lap(stage)
+        if progress is not None:
+            progress(stage, done, total)
+
+    with stopwatch.stage("import"):
+        from endotwin import fusion
+    surface = fusion.fuse(sequence, frames, training, voxel_mm, config.voxel, report)
+    stopwatch.lap(None)
+    if not surface.seen_by.any():
+        logger.warning("no training photo of %s shows the mesh: 'endotwin fit' has nothing to fit", path)
+    if len(sequence) == 1:
+        logger.warning("%s has one frame, which is fitted: none is left to score the twin by", path)
+    made = {"frames": len(frames), "voxel_mm": voxel_mm, "config": asdict(config), **stopwatch.to_dict()}
+    return Twin(surface, sequence.camera, source, record={"fuse": made})
 
 
 def fit_twin(
     twin: Twin,
-    method: str = "twin",
+    method: str | None = None,
     *,
     budget_s: float | None = None,
     epochs: int | None = None,
     seed: int = 0,
+    config: FitConfig = STANDARD.fit,
+    effects: Mapping[str, str] | None = None,
     progress: Progress | None = None,
+    checkpoint: Path | None = None,
 ) -> Twin:
     """Fit materials, light and response to the training photos.
 
     Args:
-        method: ``twin``, or ``endopbr``: Han & Wu 2025 as published.
-        budget_s: stop after so many seconds. epochs: stop after so many passes over the training photos.
+        method: ``twin``, or ``endopbr``: Han & Wu 2025 as published; the config's unless given.
+        budget_s: give the best twin of so many seconds; the config's unless given.
+        epochs: stop after so many passes over the training photos (``endopbr``).
         seed: of all random choices.
+        config: how much work to do.
+        effects: auto, on or off by name of the effect (see ``endotwin.effects.NAMES``); auto unless named.
         progress: called with (label, done, total).
+        checkpoint: file from which a stopped ``endopbr`` goes on; it is removed at the end.
 
     Raises:
         OptionError: an option makes no sense. SequenceError: the twin's sequence has moved or cannot be read.
@@ -86,7 +116,8 @@ def fit_twin(
     for name, value in (("budget", budget_s), ("number of epochs", epochs)):
         if value is not None:
             _check_positive(name, value)
-    return fit(twin, FitOptions(method=method, budget_s=budget_s, epochs=epochs, seed=seed), progress)
+    config = replace(config, method=method or config.method, budget=budget_s or config.budget)
+    return fit(twin, config, epochs, seed, progress, checkpoint, effects)
 
 
 def synthesize(
@@ -96,29 +127,92 @@ def synthesize(
     *,
     material: Iterable[str] = (),
     light: Iterable[str] = (),
+    vary: Path | str | None = None,
+    camera: Path | str | None = None,
+    labels: str | None = None,
+    layout: str = "c3vd",
+    limits: Limits | None = None,
     seed: int = 0,
+    workers: int = 1,
+    scheduler: str | None = None,
     overwrite: bool = False,
     progress: Progress | None = None,
 ) -> Summary:
-    """Render a labelled dataset from a fitted twin, in C3VD's layout.
+    """Render a labelled dataset from a fitted twin.
 
     Args:
-        trajectory: a pose file, ``jitter:…`` or ``centerline:…`` (see ``endotwin.synth.parse_trajectory``).
-        out: the folder to make.
+        trajectory: a pose file, ``jitter:…``, ``centerline:…``, ``spline:…`` or ``orbit:…`` (see
+            ``endotwin.synth.parse_trajectory``).
+        out: the folder to make. A run that stops leaves ``OUT.partial``, and the same call goes on there.
         material: edits such as ``roughness*1.3``. light: edits such as ``intensity*0.8``.
+        vary: YAML file of ranges that edits are drawn from (see ``endotwin.synth.read_variation``).
+        camera: a ``camera.json`` to render through; the twin's own camera unless given.
+        labels: names such as ``rgb,depth`` (see ``endotwin.synth.LABELS``), or ``all``.
+        layout: one of ``endotwin.synth.LAYOUTS``.
+        limits: what a pose must keep to be rendered.
         seed: of all random choices; the same twin, arguments and seed give the same bytes.
+        workers: processes to render in, where 1 is this one; with more, a script needs the guard
+            ``if __name__ == "__main__":``. 0: the cores that there are, where that is worth it.
+        scheduler: address of a Dask scheduler to render on.
         progress: called with (label, done, total).
 
     Raises:
         TwinError: the twin is not fitted. TrajectoryError: no trajectory, or one that leaves the lumen.
-        OptionError: an edit is not understood. OutputError: ``out`` exists, or cannot be written.
+        OptionError: an edit, label or layout is not understood. OutputError: ``out`` exists, or cannot be
+        written.
     """
-    edits = {
-        "material_edits": [parse_material_edit(edit) for edit in material],
-        "light_edits": [parse_light_edit(edit) for edit in light],
-    }
-    poses = parse_trajectory(trajectory, twin, seed)
-    return render_dataset(twin, poses, out, seed=seed, overwrite=overwrite, progress=progress, **edits)
+    from endotwin.synth import render_dataset
+
+    job = _job(twin, trajectory, material, light, vary, camera, labels, layout, limits, seed)
+    return render_dataset(job, out, workers, scheduler, overwrite, progress)
+
+
+def preview(
+    twin: Twin,
+    trajectory: str,
+    out: Path | str,
+    *,
+    material: Iterable[str] = (),
+    light: Iterable[str] = (),
+    vary: Path | str | None = None,
+    camera: Path | str | None = None,
+    limits: Limits | None = None,
+    seed: int = 0,
+    overwrite: bool = False,
+) -> str:
+    """Draw the poses of a trajectory in the mesh, and some of the frames that ``synthesize`` would render.
+
+    Arguments and errors are those of ``synthesize``; ``out`` is a PNG file. Returns what was written, in a
+    line.
+    """
+    from endotwin.synth import preview as draw
+
+    job = _job(twin, trajectory, material, light, vary, camera, "rgb", "c3vd", limits, seed)
+    return draw.preview(job, out, overwrite)
+
+
+def _job(
+    twin: Twin,
+    trajectory: str,
+    material: Iterable[str],
+    light: Iterable[str],
+    vary: Path | str | None,
+    camera: Path | str | None,
+    labels: str | None,
+    layout: str,
+    limits: Limits | None,
+    seed: int,
+) -> Job:
+    from endotwin import synth
+
+    lens = read_camera(Path(camera)) if camera else twin.camera
+    edits = [synth.parse_material_edit(edit) for edit in material]
+    variation = synth.fixed(edits, [synth.parse_light_edit(edit) for edit in light])
+    if vary:
+        variation = synth.read_variation(Path(vary), twin, variation)
+    chosen = synth.parse_labels(labels) if labels else synth.DEFAULT_LABELS
+    poses = synth.parse_trajectory(trajectory, twin, seed, lens, limits)
+    return synth.make_job(twin, poses, seed, chosen, layout, lens, variation)
 
 
 def _check_positive(name: str, value: float) -> None:

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
+import cv2
 import numpy as np
 import torch
 
@@ -13,12 +14,13 @@ from endotwin import shading
 from endotwin.cameras import Camera
 from endotwin.casting import Caster, Correspondences
 from endotwin.errors import TwinError
-from endotwin.incidence import Incidence, incidence_on, to_camera
+from endotwin.illumination import Illumination, ViewLight
+from endotwin.incidence import to_camera
 from endotwin.silhouettes import discontinuities
 from endotwin.twin import Twin
 
 SUBPIXELS = 2
-"""A silhouette pixel is the mean of SUBPIXELS² rays."""
+"""A pixel at a silhouette or a shadow's edge is the mean of SUBPIXELS² rays."""
 
 
 @dataclass(frozen=True)
@@ -34,11 +36,13 @@ class View:
 
     Attributes:
         color: float32 [H, W, 3], display-encoded, in [0, 1]; 0 where no surface is seen.
+        radiance: float32 [H, W, 3], linear, before the response; 1 is display white.
         hits: the pixel → surface correspondences behind it.
         shape: (H, W).
     """
 
     color: np.ndarray
+    radiance: np.ndarray
     hits: Correspondences
     shape: tuple[int, int]
     _renderer: Renderer
@@ -78,72 +82,105 @@ def laid_out(values: np.ndarray, pixel: np.ndarray, shape: tuple[int, int], empt
 
 
 class Renderer:
-    """Renders views of one fitted twin through one camera; may be called from several threads."""
+    """Renders views of one fitted twin through one camera; may be called from several threads.
 
-    def __init__(self, twin: Twin, camera: Camera | None = None, threads: int = 2):
+    Args:
+        camera: the twin's own unless given. threads: of the ray casting.
+        caster: one of the same surface, to share. exposure: factor on the radiance, one or one a channel.
+    """
+
+    def __init__(
+        self,
+        twin: Twin,
+        camera: Camera | None = None,
+        threads: int = 2,
+        caster: Caster | None = None,
+        exposure: Sequence[float] | float = 1.0,
+    ):
         if not twin.fitted:
             raise TwinError("the twin has no materials yet; run 'endotwin fit' on it first")
         self.twin = twin
         self.camera = camera or twin.camera
-        self._caster = Caster(twin.surface, threads)
+        self.caster = caster or Caster(twin.surface, threads)
+        self._illumination = Illumination(twin, self.caster)
+        self._exposure = np.asarray(exposure, np.float32)
         materials = twin.materials
         columns = [materials.base_color, materials.roughness[:, None], materials.metallic[:, None]]
         self._normal_and_material = np.concatenate([twin.surface.normals, *columns], axis=1)
 
-    def view(self, T_world_camera: np.ndarray, mask: np.ndarray | None = None) -> View:
+    def view(self, T_world_camera: np.ndarray, mask: np.ndarray | None = None, exposure: float = 1.0) -> View:
         """The view from ``T_world_camera`` [4, 4], of the pixels in ``mask`` [H, W] if given.
 
-        Colours of silhouette pixels (and of those beside the mask's edge), and only those, are means over the
-        pixel's area; labels are of its centre.
+        Colours of pixels at silhouettes and shadow edges (and of those beside the mask's edge), and only
+        those, are means over the pixel's area; labels are of its centre. ``exposure`` is a factor on the
+        radiance of this view.
         """
         shape = (self.camera.height, self.camera.width)
-        hits, normals, radiance = self._cast(self.camera, T_world_camera, mask)
+        light = self._illumination.at(T_world_camera)
+        hits, normals, radiance, visible = self._cast(self.camera, light, T_world_camera, mask)
         z = self.camera.pixel_directions.reshape(-1, 3)[:, 2].take(hits.pixel)
         radiance = laid_out(radiance, hits.pixel, shape)
-        silhouette = discontinuities(laid_out(hits.distance_mm * z, hits.pixel, shape, np.nan))
-        silhouette &= self._sees if mask is None else mask
-        radiance[silhouette] = self._mean_radiance(np.argwhere(silhouette)[:, ::-1], T_world_camera)
+        edges = discontinuities(laid_out(hits.distance_mm * z, hits.pixel, shape, np.nan))
+        if visible is not None:
+            edges |= shadow_edges(laid_out(visible, hits.pixel, shape))
+        edges &= self._sees if mask is None else mask
+        radiance[edges] = self._mean_radiance(np.argwhere(edges)[:, ::-1], light, T_world_camera)
+        radiance *= self._exposure * exposure
+        if self._transmission is not None:
+            radiance *= self._transmission
         color = shading.respond(torch.from_numpy(radiance), self.twin.response.gamma).clamp(0, 1).numpy()
-        return View(color, hits, shape, self, normals)
+        return View(color, radiance, hits, shape, self, normals)
+
+    @cached_property
+    def _transmission(self) -> np.ndarray | None:
+        """Share of the light that the lens passes, float32 [H, W, 1]; None: all."""
+        if "vignetting" not in self.twin.effects:
+            return None
+        height, width = self.camera.height, self.camera.width
+        passed = self.twin.effects["vignetting"].transmission(self.camera, np.arange(height * width))
+        return passed.reshape(height, width, 1)
 
     @cached_property
     def _sees(self) -> np.ndarray:
         """Bool [H, W]: pixels through which the lens sees at all."""
         return np.isfinite(self.camera.pixel_directions).all(axis=2)
 
-    def _mean_radiance(self, uv: np.ndarray, T_world_camera: np.ndarray) -> np.ndarray:
-        """Radiance float32 [N, 3], averaged over the area of pixels ``uv`` [N, 2]; no surface is black."""
+    def _mean_radiance(self, uv: np.ndarray, light: ViewLight, T_world_camera: np.ndarray) -> np.ndarray:
+        """Radiance float32 [N, 3], averaged over what is seen of the surface in the area of pixels ``uv``
+        [N, 2].
+
+        A slit that no depth map saw, behind the rim of a fold, would else be a black dot. No surface is
+        black.
+        """
         inside = (np.arange(SUBPIXELS) + 0.5) / SUBPIXELS - 0.5
         offsets = np.stack(np.meshgrid(inside, inside), axis=-1).reshape(-1, 2)
         rays = Rays(self.camera.directions(uv[:, None] + offsets).astype(np.float32))
-        hits, _, radiance = self._cast(rays, T_world_camera)
-        return laid_out(radiance, hits.pixel, (len(uv), len(offsets))).mean(axis=1)
+        hits, _, radiance, _ = self._cast(rays, light, T_world_camera)
+        total = laid_out(radiance, hits.pixel, (len(uv), len(offsets))).sum(axis=1)
+        count = np.bincount(hits.pixel // len(offsets), minlength=len(uv)).astype(np.float32)
+        return total / np.maximum(count, 1)[:, None]
 
     def _cast(
-        self, rays: Camera | Rays, T_world_camera: np.ndarray, mask: np.ndarray | None = None
-    ) -> tuple[Correspondences, np.ndarray, np.ndarray]:
-        """Hits [N], their unit normals in the camera frame [N, 3], and their radiance [N, 3]."""
-        hits = self._caster.cast(rays, T_world_camera, mask)
+        self,
+        rays: Camera | Rays,
+        light: ViewLight,
+        T_world_camera: np.ndarray,
+        mask: np.ndarray | None = None,
+    ) -> tuple[Correspondences, np.ndarray, np.ndarray, np.ndarray | None]:
+        """Hits [N], their unit normals in the camera frame [N, 3], their radiance [N, 3], and which light
+        guides they see [N, K] (None where no shadow is cast)."""
+        hits = self.caster.cast(rays, T_world_camera, mask)
         mixed = hits.interpolate(self.twin.surface, self._normal_and_material)
         normals = to_camera(mixed[:, :3], T_world_camera)
-        return (
-            hits,
-            normals,
-            self._shade(incidence_on(normals, hits, rays), torch.from_numpy(mixed[:, 3:])).numpy(),
+        radiance, visible = light.radiance(
+            hits, rays.pixel_directions, normals, torch.from_numpy(mixed[:, 3:])
         )
+        return hits, normals, radiance.numpy(), visible
 
-    def _shade(self, geometry: Incidence, material: torch.Tensor) -> torch.Tensor:
-        """Radiance [N, 3] of hits with ``material`` [N, 5]: base colour, roughness, metallic."""
-        light, twin = self.twin.light, self.twin
-        cos, sin2, log_cos_axis, log_distance = (torch.from_numpy(value) for value in vars(geometry).values())
-        strength = torch.exp(
-            shading.log_spotlight(
-                math.log(max(light.L0, 1e-30)), light.n, light.q, log_cos_axis, log_distance
-            )
-        )
-        roughness = material[:, 3]
-        lobe = shading.diffuse(material[:, :3], material[:, 4])
-        if twin.materials.diffuse == "burley":
-            lobe = lobe * shading.burley(cos, cos, torch.ones_like(cos), roughness)[:, None]
-        shine = twin.materials.f0 * shading.specular_colocated(cos, sin2, roughness)
-        return (lobe + shine[:, None]) * (strength * cos * (2 * math.pi))[:, None]
+
+def shadow_edges(visible: np.ndarray) -> np.ndarray:
+    """Bool [H, W]: pixels beside which some guide is seen by one and not by another; ``visible`` [H, W,
+    K]."""
+    cross = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
+    edges = cv2.morphologyEx(np.ascontiguousarray(visible), cv2.MORPH_GRADIENT, cross)
+    return edges.reshape(*visible.shape).max(axis=2) > 0

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -95,10 +96,35 @@ def specular(
     return ggx(sin2_m, alpha) * smith_visibility(cos_i, cos_o, alpha) * fresnel
 
 
+def specular_lobe(cos_i: Tensor, cos_o: Tensor, sin2_m: Tensor, roughness: Tensor) -> Tensor:
+    """``specular`` per unit of f0, for a light so near the lens that Schlick's (1 − cos_d)⁵ vanishes: 1e-9
+    at 10° between them."""
+    alpha = roughness.clamp_min(ROUGHNESS_MIN) ** 2
+    return ggx(sin2_m, alpha) * smith_visibility(cos_i, cos_o, alpha)
+
+
 def specular_colocated(cos: Tensor, sin2: Tensor, roughness: Tensor) -> Tensor:
     """``specular`` per unit of f0, with the light at the lens: wi = wo = wm, so cos_d = 1 and F = f0."""
     alpha = roughness.clamp_min(ROUGHNESS_MIN) ** 2
     return ggx(sin2, alpha) * smith_visibility(cos, cos, alpha)
+
+
+def specular_of_even_light(cos_o: Tensor, roughness: Tensor, f0: float) -> Tensor:
+    """Share of light from all around that the white GGX lobe sends to the camera, [N]: Karis 2014
+    ("Physically Based Shading on Mobile"), a fit to Lazarov's table, within 0.01 of the integral."""
+    first = 1 - roughness
+    grazing = torch.minimum(first * first, torch.exp2(-9.28 * cos_o)) * first + 0.0425 - 0.0275 * roughness
+    scale = -1.04 * grazing + 1.04 - 0.572 * roughness
+    bias = 1.04 * grazing - 0.04 + 0.022 * roughness
+    return f0 * scale + bias
+
+
+def specular_albedo(roughness: Tensor, f0: float) -> Tensor:
+    """Share of light from all around that the white GGX lobe sends back in all, [N]: 2·∫ρ(cos)·cos d cos."""
+    nodes, weights = np.polynomial.legendre.leggauss(8)
+    cos = torch.from_numpy((nodes + 1) / 2).to(roughness.dtype)
+    share = specular_of_even_light(cos, roughness[..., None], f0)
+    return (share * cos * torch.from_numpy(weights).to(roughness.dtype)).sum(dim=-1)
 
 
 def respond(radiance: Tensor, gamma: float | Tensor) -> Tensor:

@@ -29,11 +29,14 @@ class Stopwatch:
 
     Attributes:
         seconds: wall-clock seconds a stage; a stage entered again adds to its own.
+        parts: seconds of the parts of some stages.
     """
 
     def __init__(self) -> None:
         self.seconds: dict[str, float] = {}
+        self.parts: dict[str, dict[str, float]] = {}
         self._started = time.perf_counter()
+        self._lap: tuple[str, float] | None = None
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
@@ -44,19 +47,43 @@ class Stopwatch:
         finally:
             self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - started
 
+    def lap(self, name: str | None) -> None:
+        """From now on time ``name``, until another lap (or None) begins."""
+        now = time.perf_counter()
+        if self._lap is not None:
+            lap, started = self._lap
+            self.seconds[lap] = self.seconds.get(lap, 0.0) + now - started
+        self._lap = None if name is None else (name, now)
+
     @property
     def total(self) -> float:
         """Seconds since the stopwatch was made, what no stage claimed included."""
         return time.perf_counter() - self._started
 
     def to_dict(self) -> dict:
-        """``{"stages": {name: s}, "seconds": s, "peak_memory_mb": MB}``."""
+        """``{"stages": {name: s}, "parts": {stage: {part: s}}, "seconds": s, "peak_memory_mb": MB}``.
+
+        ``parts`` is left out where there are none.
+        """
+        parts = {name: _rounded(seconds) for name, seconds in self.parts.items()}
         return {
-            "stages": {name: round(seconds, 3) for name, seconds in self.seconds.items()},
+            "stages": _rounded(self.seconds),
+            **({"parts": parts} if parts else {}),
             "seconds": round(self.total, 3),
             "peak_memory_mb": round(peak_memory_mb(), 1),
         }
 
     def __str__(self) -> str:
-        stages = " · ".join(f"{name} {seconds:.1f} s" for name, seconds in self.seconds.items())
+        stages = " · ".join(
+            f"{name} {seconds:.1f} s{_shown(self.parts.get(name, {}))}"
+            for name, seconds in self.seconds.items()
+        )
         return f"{stages} · total {self.total:.1f} s, peak memory {peak_memory_mb() / 1000:.2f} GB"
+
+
+def _rounded(seconds: dict[str, float]) -> dict[str, float]:
+    return {name: round(value, 3) for name, value in seconds.items()}
+
+
+def _shown(parts: dict[str, float]) -> str:
+    return f" ({', '.join(f'{name} {value:.1f}' for name, value in parts.items())})" if parts else ""

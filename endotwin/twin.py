@@ -11,14 +11,18 @@ from safetensors import SafetensorError
 from safetensors.numpy import load_file, save_file
 
 from endotwin.cameras import Camera, camera_from_dict
-from endotwin.errors import TwinError
-from endotwin.output import whole_folder
+from endotwin.effects import Decision, Effects
+from endotwin.errors import SequenceError, TwinError
+from endotwin.jsontext import parsed
+from endotwin.output import TWIN, whole_folder
 from endotwin.readers import open_sequence
 from endotwin.sequence import Sequence
 from endotwin.shading import F0_DIELECTRIC
+from endotwin.soundness import require_sound
 from endotwin.surface import Surface
 
 VERSION = 1
+FILES = (TWIN, "surface.safetensors", "materials.safetensors", "effects.json")
 MAPS = ("base_color", "roughness", "metallic")
 HOLDOUT_EVERY = 8
 
@@ -71,6 +75,7 @@ class Source:
         geometry: ``known`` (every frame's depth was fused) or ``heldout`` (held-out frames gave neither
             depth nor photo).
         holdout_every: every n-th frame, from the first, is held out of the fit.
+        frames: of more training frames than these, so many are used, evenly spread; None: all.
     """
 
     path: str
@@ -78,6 +83,7 @@ class Source:
     scale: float = 1.0
     geometry: str = "known"
     holdout_every: int = HOLDOUT_EVERY
+    frames: int | None = None
 
     def open(self) -> Sequence:
         """The sequence; raises SequenceError if it has moved or changed its shape."""
@@ -90,7 +96,10 @@ class Source:
     def training(self, count: int) -> list[int]:
         """Indices of the frames whose photos may be fitted."""
         heldout = set(self.heldout(count))
-        return [index for index in range(count) if index not in heldout]
+        training = [index for index in range(count) if index not in heldout]
+        if self.frames is None or len(training) <= self.frames:
+            return training
+        return [training[i] for i in np.linspace(0, len(training) - 1, self.frames).round().astype(int)]
 
 
 @dataclass(frozen=True)
@@ -103,6 +112,7 @@ class Twin:
         source: where the photos are, and the protocol.
         materials, light, response: None until ``fit``.
         record: how the twin was made: options, seconds of each stage, scores.
+        effects: what it has beside the paper's light and materials. decisions: why, by name of the effect.
     """
 
     surface: Surface
@@ -112,6 +122,8 @@ class Twin:
     light: Light | None = None
     response: Response | None = None
     record: dict = field(default_factory=dict)
+    effects: Effects = field(default_factory=Effects)
+    decisions: dict[str, Decision] = field(default_factory=dict)
 
     @property
     def fitted(self) -> bool:
@@ -127,13 +139,33 @@ class Twin:
         else:
             lines.append("not fitted")
         scores = self.record.get("eval")
-        if scores:
+        if scores and scores.get("psnr") is not None:
             lines.append(f"held out: {scores['psnr']:.2f} dB, SSIM {scores['ssim']:.4f}")
         return "Twin(\n  " + "\n  ".join(lines) + "\n)"
 
     def with_record(self, **entries) -> Twin:
         """The same twin with ``entries`` added to its record."""
         return replace(self, record={**self.record, **entries})
+
+    def exposure(self, frame: int) -> float:
+        """Factor on the radiance of the sequence's frame with this index: its gain, where gain was found."""
+        return float(self.effects["gain"].of(np.array([frame]))[0]) if "gain" in self.effects else 1.0
+
+    def at_scale(self, scale: float) -> Twin:
+        """The same twin, seen by its camera with images of another factor of the photos' size."""
+        source = replace(self.source, scale=scale)
+        return replace(self, source=source, camera=source.open().camera)
+
+    def sequence(self) -> Sequence:
+        """The sequence that the twin was made from; raises SequenceError if it is gone or of another size."""
+        sequence = self.source.open()
+        sizes = [f"{camera.width}×{camera.height}" for camera in (sequence.camera, self.camera)]
+        if sizes[0] != sizes[1]:
+            raise SequenceError(
+                f"{self.source.path} has frames of {sizes[0]} at the twin's scale, but the twin was made "
+                f"from {sizes[1]}; make it again with 'endotwin fuse'"
+            )
+        return sequence
 
     def show(self, screenshot: Path | None = None) -> None:
         """Open the inspector's window, or write its picture to ``screenshot``."""
@@ -145,9 +177,9 @@ class Twin:
         """Write the twin folder, whole or not at all.
 
         Raises:
-            OutputError: ``path`` exists and ``overwrite`` is false.
+            OutputError: ``path`` exists and ``overwrite`` is false, or it is something else than a twin.
         """
-        with whole_folder(path, overwrite) as folder:
+        with whole_folder(path, FILES, overwrite) as folder:
             self.surface.save(folder / "surface.safetensors")
             if self.fitted:
                 save_file(self.materials.per_vertex, folder / "materials.safetensors")
@@ -160,8 +192,12 @@ class Twin:
                 else None,
                 "light": asdict(self.light) if self.light else None,
                 "response": asdict(self.response) if self.response else None,
+                "effects": self.effects.to_dict(),
                 "record": self.record,
             }
+            if self.decisions:
+                decisions = {name: asdict(decision) for name, decision in self.decisions.items()}
+                (folder / "effects.json").write_text(json.dumps({"effects": decisions}, indent=1) + "\n")
             (folder / "twin.json").write_text(json.dumps(document, indent=1) + "\n")
 
     @classmethod
@@ -175,7 +211,7 @@ class Twin:
         document = _read_document(path)
         try:
             constants = document["materials"]
-            return cls(
+            twin = cls(
                 surface=Surface.load(path / "surface.safetensors"),
                 camera=camera_from_dict(document["camera"], path / "twin.json"),
                 source=Source(**document["source"]),
@@ -185,17 +221,29 @@ class Twin:
                 light=Light(**document["light"]) if document["light"] else None,
                 response=Response(**document["response"]) if document["response"] else None,
                 record=document["record"],
+                effects=Effects.from_dict(document.get("effects", {})),
+                decisions=_read_decisions(path / "effects.json"),
             )
-        except (OSError, KeyError, TypeError, ValueError, SafetensorError) as error:
+            return require_sound(twin)
+        except (OSError, KeyError, TypeError, ValueError, AttributeError, SafetensorError) as error:
             raise TwinError(
                 f"{path} is a damaged twin ({error}); make it again with 'endotwin fuse'"
             ) from error
 
 
+def _read_decisions(path: Path) -> dict[str, Decision]:
+    if not path.exists():
+        return {}
+    document = parsed(path.read_text(encoding="utf-8"))
+    return {name: Decision(**values) for name, values in document["effects"].items()}
+
+
 def _read_document(path: Path) -> dict:
     try:
-        document = json.loads((path / "twin.json").read_text())
+        document = parsed((path / "twin.json").read_text(encoding="utf-8"))
         version = document["version"]
+    except NotADirectoryError:
+        raise TwinError(f"{path} is a file; give the folder of the twin") from None
     except FileNotFoundError:
         raise TwinError(
             f"{path} is not a twin (it has no twin.json); make one with 'endotwin fuse SEQUENCE -o {path}'"
@@ -204,6 +252,8 @@ def _read_document(path: Path) -> dict:
         raise TwinError(
             f"{path / 'twin.json'} cannot be read ({error}); make the twin again with 'endotwin fuse'"
         ) from error
+    if not isinstance(version, int):
+        raise TwinError(f"{path / 'twin.json'} has no version; make the twin again with 'endotwin fuse'")
     if version > VERSION:
         raise TwinError(
             f"{path} is a twin of version {version}, newer than this endotwin reads (version {VERSION}); "

@@ -7,6 +7,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -17,6 +18,7 @@ import tifffile
 import tube_sequence
 from endotwin.cli import console
 from endotwin.cli.main import main
+from endotwin.cli.stop import Stopped, heed_signals
 
 FRAMES = 10
 
@@ -152,6 +154,27 @@ def test_a_frame_that_is_all_invalid_is_skipped_with_a_warning_that_names_it(end
     assert len(warnings) == 1 and "0003_depth.tiff" in warnings[0]
 
 
+@pytest.mark.parametrize(
+    ("spoil", "says"),
+    [
+        (lambda T: np.divide(T[:, :3, 3], 1000, out=T[:, :3, 3]), "endotwin check"),
+        (lambda T: np.copyto(T, T @ np.diag([1, -1, -1, 1.0])), "endotwin check"),
+        (lambda T: np.multiply(T[:, :3, 3], 1000, out=T[:, :3, 3]), "unit"),
+        (lambda T: np.add(T[5, :3, 3], 5e4, out=T[5, :3, 3]), "0005_color.png"),
+        (lambda T: np.add(T[5, :3, 3], (3, 0, 0), out=T[5, :3, 3]), "0005_depth.tiff"),
+    ],
+    ids=["metres", "OpenGL's axes", "micrometres", "one far away", "one beside its place"],
+)
+def test_poses_that_the_depth_contradicts_give_a_warning_that_names_the_suspect(
+    endotwin, tube, tmp_path, spoil, says
+):
+    edit_poses(tube, spoil)
+    code, _, err = endotwin("fuse", tube, "-o", tmp_path / "twin")
+    assert code == 0, err
+    warnings = [line for line in err.splitlines() if line.startswith("warning: ")]
+    assert len(warnings) == 1 and says in warnings[0]
+
+
 def test_help_is_instant_because_nothing_slow_is_imported():
     code = (
         "import sys; sys.argv = ['endotwin', '--help']\n"
@@ -163,10 +186,10 @@ def test_help_is_instant_because_nothing_slow_is_imported():
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, encoding="utf-8")
     assert done.returncode == 0, done.stderr
-    assert all(command in done.stdout for command in ("fuse", "fit", "eval", "synth", "inspect"))
+    assert all(command in done.stdout for command in ("fuse", "fit", "eval", "synth", "tradeoff"))
 
 
-@pytest.mark.parametrize("command", ["fuse", "fit", "eval", "synth", "inspect"])
+@pytest.mark.parametrize("command", ["fuse", "fit", "eval", "synth", "inspect", "tradeoff"])
 def test_every_command_explains_itself_with_an_example(endotwin, command):
     code, out, _ = endotwin(command, "--help")
     assert code == 0 and f"endotwin {command}" in out and "Example" in out
@@ -176,6 +199,20 @@ def test_version_is_that_of_the_package(endotwin):
     from importlib.metadata import version
 
     assert endotwin("--version")[:2] == (0, f"endotwin {version('endotwin')}\n")
+
+
+def test_ctrl_c_in_the_middle_of_an_import_stops_the_command_after_it(tmp_path, monkeypatch):
+    (tmp_path / "a_library.py").write_text(
+        "import os, signal\n"
+        "try:\n    os.kill(os.getpid(), signal.SIGINT)\n    str()\n"
+        "except BaseException:\n    raise ImportError('as C extensions do')\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    heed_signals()
+    with pytest.raises(Stopped):
+        import a_library  # noqa: F401
+
+        time.sleep(10)
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
@@ -269,6 +306,26 @@ def test_a_sequence_with_no_valid_depth(fails, tube, tmp_path):
     assert "valid depth" in fails("fuse", tube, "-o", tmp_path / "twin")
 
 
+def test_photos_that_are_all_clipped_give_a_warning_that_says_so(endotwin, tube, tmp_path):
+    for file in tube.glob("*_color.png"):
+        cv2.imwrite(str(file), np.full((72, 96, 3), 255, np.uint8))
+    assert endotwin("fuse", tube, "-o", tmp_path / "twin")[0] == 0
+    code, _, err = endotwin("fit", tmp_path / "twin", "--budget", 1)
+    assert code == 0 and "unclipped" in err
+
+
+def test_photos_that_are_all_black(fails, tube, tmp_path):
+    for file in tube.glob("*_color.png"):
+        cv2.imwrite(str(file), np.zeros((72, 96, 3), np.uint8))
+    assert "black photos" in fails("fuse", tube, "-o", tmp_path / "twin")
+
+
+def test_a_sequence_of_one_frame_says_that_none_is_left_to_score_by(endotwin, tmp_path):
+    tube_sequence.write(tmp_path / "tube", 1)
+    code, _, err = endotwin("fuse", tmp_path / "tube", "-o", tmp_path / "twin")
+    assert code == 0 and "one frame" in err
+
+
 def test_an_unknown_camera_model(fails, tube, tmp_path):
     (tube / "camera.json").write_text(json.dumps({"model": "periscope", "width": 96, "height": 72}))
     message = fails("fuse", tube, "-o", tmp_path / "twin")
@@ -286,9 +343,13 @@ def test_a_trajectory_outside_the_mesh(fails, made, tmp_path):
     assert "pose 1" in message
 
 
-@pytest.mark.parametrize("spec", ["nowhere.txt", "jitter:frames=many", "jitter:colour=3"])
+@pytest.mark.parametrize(
+    "spec",
+    ["nowhere.txt", "jitter:frames=many", "jitter:colour=3", "jitter:frames=10000000", "centerline:x=1"],
+)
 def test_a_trajectory_that_cannot_be_understood(fails, made, tmp_path, spec):
-    fails("synth", made / "twin", "--trajectory", spec, "-o", tmp_path / "dataset")
+    message = fails("synth", made / "twin", "--trajectory", spec, "-o", tmp_path / "dataset")
+    assert spec in message and len(message) < 350
 
 
 @pytest.mark.parametrize(
@@ -296,29 +357,101 @@ def test_a_trajectory_that_cannot_be_understood(fails, made, tmp_path, spec):
     [
         ["fuse", "{made}/tube", "-o", "{taken}"],
         ["fit", "{made}/twin", "-o", "{taken}"],
-        ["eval", "{made}/twin", "--sheet", "{taken}"],
+        ["eval", "{made}/twin", "--sheet", "{taken}.png"],
         ["synth", "{made}/twin", "--trajectory", "jitter:", "-o", "{taken}"],
-        ["inspect", "{made}/twin", "--screenshot", "{taken}"],
+        ["inspect", "{made}/twin", "--screenshot", "{taken}.png"],
     ],
     ids=lambda command: command[0],
 )
 def test_an_output_that_exists(fails, made, tmp_path, command):
-    taken = tmp_path / "taken"
-    taken.write_text("precious")
-    message = fails(*[part.format(made=made, taken=taken) for part in command])
-    assert "taken" in message and "--overwrite" in message
-    assert taken.read_text() == "precious"
+    for name in ("taken", "taken.png"):
+        (tmp_path / name).write_text("precious")
+    message = fails(*[part.format(made=made, taken=tmp_path / "taken") for part in command])
+    assert "taken" in message and "exists already" in message
+    assert (tmp_path / "taken").read_text() == (tmp_path / "taken.png").read_text() == "precious"
 
 
-def test_overwrite_replaces_an_output(endotwin, made, tmp_path):
-    (tmp_path / "twin").mkdir()
-    (tmp_path / "twin" / "stale").touch()
+def test_overwrite_replaces_a_twin_and_keeps_what_is_not_the_twins(endotwin, made, tmp_path):
+    shutil.copytree(made / "twin", tmp_path / "twin")
+    (tmp_path / "twin" / "notes").touch()
     code, _, err = endotwin("fuse", made / "tube", "-o", tmp_path / "twin", "--overwrite")
     assert code == 0, err
     assert sorted(entry.name for entry in (tmp_path / "twin").iterdir()) == [
+        "notes",
         "surface.safetensors",
         "twin.json",
     ]
+
+
+@pytest.mark.parametrize(
+    ("command", "says"),
+    [
+        (["fuse", "tube", "-o", "tube"], "no twin.json"),
+        (["fuse", "tube", "-o", "."], "no twin.json"),
+        (["fuse", "tube", "-o", "photo.png"], "no twin.json"),
+        (["fit", "twin", "-o", "tube"], "no twin.json"),
+        (["synth", "twin", "--trajectory", "jitter:", "-o", "twin"], "no dataset.json"),
+        (["synth", "dataset/twin", "--trajectory", "jitter:", "-o", "dataset"], "is read from it"),
+        (["synth", "twin", "--trajectory", "dataset/pose.txt", "-o", "dataset"], "is read from it"),
+        (["eval", "twin", "--sheet", "twin/twin.json"], ".png"),
+        (["eval", "twin", "--sheet", "tube"], ".png"),
+        (["eval", "twin", "--sheet", "folder.png"], "is a folder"),
+        (["inspect", "twin", "--screenshot", "tube/camera.json"], ".png"),
+    ],
+    ids=lambda part: " ".join(part) if isinstance(part, list) else "",
+)
+def test_overwrite_destroys_no_input_and_nothing_that_endotwin_did_not_write(
+    fails, made, tmp_path, monkeypatch, command, says
+):
+    for name in ("tube", "twin"):
+        shutil.copytree(made / name, tmp_path / name)
+    shutil.copytree(made / "twin", tmp_path / "dataset" / "twin")
+    for name in ("dataset.json", "pose.txt"):
+        (tmp_path / "dataset" / name).touch()
+    (tmp_path / "folder.png").mkdir()
+    (tmp_path / "photo.png").write_text("precious")
+    monkeypatch.chdir(tmp_path)
+    assert says in fails(*command, "--overwrite")
+
+
+@pytest.mark.parametrize("taken", ["twin/twin.json", "tube/camera.json", "tube/0000_color.png", "tube"])
+def test_a_profile_replaces_nothing_but_a_profile(fails, made, tmp_path, monkeypatch, taken):
+    for name in ("tube", "twin"):
+        shutil.copytree(made / name, tmp_path / name)
+    monkeypatch.chdir(tmp_path)
+    before = {file: file.read_bytes() for file in tmp_path.rglob("*") if file.is_file()}
+    assert taken in fails("fuse", "tube", "-o", "new", "--profile", taken)
+    assert {file: file.read_bytes() for file in tmp_path.rglob("*") if file.is_file()} == before
+
+
+def test_a_profile_is_replaced_by_the_next(endotwin, made, tmp_path):
+    shutil.copytree(made / "twin", tmp_path / "twin")
+    for command in (["eval", tmp_path / "twin"], ["fuse", made / "tube", "-o", tmp_path / "new"]):
+        code, _, err = endotwin(*command, "--profile", tmp_path / "profile.json")
+        assert code == 0, err
+        assert json.loads((tmp_path / "profile.json").read_text())["command"] == command[0]
+
+
+def test_a_twin_is_scored_and_fitted_from_where_one_stands_and_keeps_its_guests(
+    endotwin, made, tmp_path, monkeypatch
+):
+    shutil.copytree(made / "twin", tmp_path / "twin")
+    monkeypatch.chdir(tmp_path / "twin")
+    for command in (["eval", ".", "--sheet", "sheet.png"], ["fit", ".", "--overwrite", "--budget", 1]):
+        code, _, err = endotwin(*command, "--profile", "profile.json")
+        assert code == 0, err
+        assert {"sheet.png", "profile.json", "twin.json", "materials.safetensors"} <= set(os.listdir("."))
+
+
+def test_the_scores_are_printed_even_if_they_cannot_be_kept(endotwin, made, tmp_path, monkeypatch):
+    from endotwin.twin import Twin
+
+    def save(self: Twin, path: Path, overwrite: bool) -> None:
+        raise OSError(errno.EBUSY, "Device or resource busy", str(path))
+
+    monkeypatch.setattr(Twin, "save", save)
+    code, out, err = endotwin("eval", made / "twin")
+    assert code == 2 and "mean" in out and err.count("\n") == 1
 
 
 def test_a_fitted_twin_is_not_fitted_again_by_accident(fails, made):
@@ -360,14 +493,21 @@ def test_an_unfitted_twin_has_no_scores_and_no_dataset(fails, endotwin, made, tm
     [
         ["fuse", "{made}/tube", "-o", "{new}", "--scale", "0"],
         ["fuse", "{made}/tube", "-o", "{new}", "--scale", "nan"],
+        ["fuse", "{made}/tube", "-o", "{new}", "--scale", "20"],
+        ["fuse", "{made}/tube", "-o", "{new}", "--scale", "abc"],
+        ["fuse", "{made}/tube", "-o", "{new}", "--voxel", "1e9"],
         ["fuse", "{made}/tube", "-o", "{new}", "--voxel", "-1"],
         ["fuse", "{made}/tube", "-o", "{new}", "--geometry", "guessed"],
         ["fuse", "{made}/tube", "-o", "{new}", "--format", "betamax"],
         ["fit", "{made}/twin", "-o", "{new}", "--method", "magic"],
         ["fit", "{made}/twin", "-o", "{new}", "--budget", "0"],
         ["fit", "{made}/twin", "-o", "{new}", "--epochs", "0"],
+        ["fit", "{made}/twin", "-o", "{new}", "--seed", "-1"],
+        ["eval", "{made}/twin", "--scale", "1e9"],
         ["synth", "{made}/twin", "--trajectory", "jitter:", "-o", "{new}", "--material", "gloss*2"],
         ["synth", "{made}/twin", "--trajectory", "jitter:", "-o", "{new}", "--light", "intensity"],
+        ["synth", "{made}/twin", "--trajectory", "jitter:", "-o", "{new}", "--light", "intensity=-5"],
+        ["synth", "{made}/twin", "--trajectory", "jitter:", "-o", "{new}", "--seed", "-1"],
         ["inspect", "{made}/twin", "--screenshot", "{new}.png", "--map", "temperature"],
     ],
     ids=lambda options: " ".join(options[:1] + options[-2:]),
@@ -376,9 +516,15 @@ def test_an_option_whose_value_makes_no_sense(fails, made, tmp_path, options):
     fails(*[part.format(made=made, new=tmp_path / "new") for part in options])
 
 
-def test_a_mistyped_option_is_a_usage_error(endotwin):
-    code, _, err = endotwin("fuse", "--outptu", "x")
-    assert code == 2 and "Traceback" not in err
+@pytest.mark.parametrize(
+    "command", [["fuse", "--outptu", "x"], ["fuse"], ["bake"], ["--bake"], ["fit", "twin", "--budget"]]
+)
+def test_a_mistyped_command_is_an_error_of_one_line_that_names_the_help(fails, command):
+    assert "--help" in fails(*command)
+
+
+def test_no_command_shows_the_help(endotwin):
+    assert endotwin() == endotwin("--help")
 
 
 def test_the_installed_command_reports_errors_without_a_traceback(tmp_path):

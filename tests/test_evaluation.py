@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import tube_sequence
 
-from endotwin.errors import TwinError
+from endotwin.errors import OutputError, SequenceError, TwinError
 from endotwin.evaluation import evaluate
 from endotwin.pipeline import fuse_twin
 from endotwin.render import Renderer
@@ -103,6 +103,27 @@ def test_the_contact_sheet_has_a_row_a_frame_and_three_pictures_a_row(twin, tmp_
     assert sheet.shape == (240 * len(evaluation.frames), 3 * 320, 3)
     photo, render = sheet[:200, :320].astype(int), sheet[:200, 320:640].astype(int)
     assert np.abs(photo - render).mean() < 1
+
+
+def test_a_picture_that_is_there_is_kept_unless_it_may_be_overwritten(twin, tmp_path):
+    (tmp_path / "sheet.png").write_text("precious")
+    with pytest.raises(OutputError, match="--overwrite"):
+        evaluate(twin, tmp_path / "sheet.png")
+    assert (tmp_path / "sheet.png").read_text() == "precious"
+    evaluate(twin, tmp_path / "sheet.png", overwrite=True)
+    assert cv2.imread(str(tmp_path / "sheet.png")) is not None
+
+
+def test_a_twin_that_does_not_look_like_its_photos_gives_a_warning(twin, caplog):
+    evaluate(twin)
+    assert not caplog.text
+    assert evaluate(replace(twin, light=replace(twin.light, L0=0.2))).psnr < 20
+    assert "does not look like its photos" in caplog.text
+
+
+def test_photos_of_another_size_than_the_twins_are_refused(twin):
+    with pytest.raises(SequenceError, match="48×36 at the twin's scale, but the twin was made from 96×72"):
+        evaluate(replace(twin, source=replace(twin.source, scale=0.5)))
 
 
 def test_a_held_out_frame_without_depth_is_skipped_and_named(twin, tmp_path, caplog):

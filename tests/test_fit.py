@@ -12,8 +12,10 @@ import tube_sequence
 
 import endotwin
 from endotwin.casting import Caster
+from endotwin.config import FitConfig
 from endotwin.evaluation import covered_pixels
-from endotwin.fit import FitOptions, fit
+from endotwin.fit import fit
+from endotwin.fit.pace import Pace
 from endotwin.fit.samples import gather
 from endotwin.fit.solve import median_edge_mm, proxies
 
@@ -119,8 +121,9 @@ def test_the_same_seed_gives_the_same_twin_to_the_bit(tube):
 
 
 def test_pixels_beyond_the_number_asked_for_are_drawn_by_the_seed(tube):
-    every = gather(tube, 10**9, 0)
-    some, again, others = (gather(tube, 10_000, seed) for seed in (0, 0, 1))
+    caster = Caster(tube.surface)
+    every = gather(tube, Pace(FitConfig(pixels=10**9)), 0, caster)
+    some, again, others = (gather(tube, Pace(FitConfig(pixels=10_000)), seed, caster) for seed in (0, 0, 1))
     assert len(some) == pytest.approx(10_000 * len(every) / (8 * 96 * 72), rel=0.1)
     assert torch.equal(some.triangle, again.triangle) and torch.equal(some.cos, again.cos)
     assert len(some) != len(others) or not torch.equal(some.cos, others.cos)
@@ -129,7 +132,7 @@ def test_pixels_beyond_the_number_asked_for_are_drawn_by_the_seed(tube):
 
 def test_samples_carry_the_color_that_their_surface_point_has_under_their_incidence(tube):
     """The tube's own closed form, from each sample's point, cosine, axis angle and distance."""
-    samples = gather(tube, 10**9, 0)
+    samples = gather(tube, Pace(FitConfig(pixels=10**9)), 0, Caster(tube.surface))
     assert 0.7 < len(samples) / (8 * 96 * 72) <= 1
     corners = tube.surface.vertices_mm[tube.surface.triangles[samples.triangle.numpy()]]
     local = np.einsum("nk,nkc->nc", samples.barycentric.numpy(), corners)
@@ -177,13 +180,13 @@ def test_photos_that_show_nothing_of_the_surface_are_an_error(tube, tmp_path):
 @pytest.mark.parametrize(
     "options, message",
     [
-        (FitOptions(method="nerf"), "unknown method 'nerf'.*twin, endopbr"),
-        (FitOptions(method="twin", epochs=3), "--epochs belongs to --method endopbr"),
+        ({"config": FitConfig(method="nerf")}, "unknown method 'nerf'.*twin, endopbr"),
+        ({"epochs": 3}, "--epochs belongs to --method endopbr"),
     ],
 )
 def test_options_that_make_no_sense_are_refused(tube, options, message):
     with pytest.raises(endotwin.EndotwinError, match=message):
-        fit(tube, options)
+        fit(tube, **options)
 
 
 def test_proxies_are_the_means_of_the_vertices_of_a_cell(tube):

@@ -1,13 +1,16 @@
 """The pixel model's derivatives, and the normal equations made of them, against dense float64 references."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 
 from endotwin.fit.gauss_newton import _joint_minimum, conjugate_gradients
-from endotwin.fit.model import GLOBALS, Globals, at_pixels, linearise, predict
+from endotwin.fit.model import BOUNCE_GLOBALS, Globals, at_pixels, linearise, predict
 from endotwin.fit.normal import MeshPattern, Residual, assemble, robust_cost
-from endotwin.fit.samples import Samples, discontinuities
+from endotwin.fit.samples import Bounce, Samples, discontinuities
+from endotwin.guides import Guided
 from endotwin.twin import Light, Response
 
 SHARED = Globals.of(Light(L0=90.0, n=1.8, q=2.1), Response(0.43), f0=0.05)
@@ -40,11 +43,18 @@ def made_samples(count: int, triangle_count: int, seed: int = 0) -> Samples:
         log_cos_axis=uniform(0.5, 1.0).log(),
         log_distance=uniform(6.0, 40.0).log(),
         color=color,
+        frame=torch.zeros(count, dtype=torch.int32),
+        pixel=torch.zeros(count, dtype=torch.int32),
     )
 
 
 def single(samples: Samples) -> Samples:
-    return Samples(**{k: v.float() if v.is_floating_point() else v for k, v in vars(samples).items()})
+    return Samples(
+        **{
+            name: value.float() if value is not None and value.is_floating_point() else value
+            for name, value in vars(samples).items()
+        }
+    )
 
 
 def made_materials(count: int, seed: int = 1) -> torch.Tensor:
@@ -70,35 +80,82 @@ def test_prediction_is_the_published_image_formation_with_burleys_diffuse():
     assert 0.1 < np.median(shown) < 1
 
 
+def beside_the_lens(samples: Samples) -> Samples:
+    """The samples lit by two guides instead, and exposed unevenly."""
+    generator = torch.Generator().manual_seed(5)
+
+    def uniform(low: float, high: float) -> torch.Tensor:
+        return low + (high - low) * torch.rand(len(samples), 2, generator=generator, dtype=torch.float64)
+
+    guides = Guided(
+        cos_i=uniform(0, 0.99),
+        sin2_m=uniform(1e-3, 0.9),
+        cos_d=uniform(0.98, 1),
+        log_axis=uniform(0.5, 1).log(),
+        log_distance=uniform(6, 40).log(),
+    )
+    return replace(samples, guides=guides, log_exposure=uniform(-0.3, 0.3)[:, 0])
+
+
+def in_a_tube(samples: Samples) -> Samples:
+    """The samples lit by other tissue too."""
+    generator = torch.Generator().manual_seed(6)
+
+    def uniform(low: float, high: float, *shape: int) -> torch.Tensor:
+        return low + (high - low) * torch.rand(len(samples), *shape, generator=generator, dtype=torch.float64)
+
+    bounce = Bounce(uniform(-3, -1, 3), uniform(-0.5, 0), uniform(-4, -2), uniform(1, 2), uniform(0, 0.1))
+    return replace(samples, bounce=bounce)
+
+
+SCENES = {
+    "at the lens": lambda samples: samples,
+    "beside the lens": beside_the_lens,
+    "in a tube": in_a_tube,
+    "beside the lens in a tube": lambda samples: in_a_tube(beside_the_lens(samples)),
+}
+BOUNCE_SHARED = Globals(torch.cat([SHARED.vector, torch.tensor([0.1], dtype=torch.float64)]))
+
+
+def shared_of(scene: str) -> Globals:
+    return BOUNCE_SHARED if "tube" in scene else SHARED
+
+
+@pytest.mark.parametrize("scene", SCENES)
 @pytest.mark.parametrize("channel", range(4))
-def test_derivative_by_material_is_the_central_difference(channel):
-    samples, material = made_samples(300, 17), made_materials(300)
-    model = linearise(samples, material, SHARED)
+def test_derivative_by_material_is_the_central_difference(channel, scene):
+    samples, material = SCENES[scene](made_samples(300, 17)), made_materials(300)
+    shared = shared_of(scene)
+    model = linearise(samples, material, shared)
     step = torch.zeros(4, dtype=torch.float64)
     step[channel] = 1e-6
-    slope = (predict(samples, material + step, SHARED) - predict(samples, material - step, SHARED)) / 2e-6
+    slope = (predict(samples, material + step, shared) - predict(samples, material - step, shared)) / 2e-6
     expected = model.by_roughness if channel == 3 else torch.zeros(300, 3, dtype=torch.float64)
     if channel < 3:
         expected[:, channel] = model.by_color[:, channel]
     torch.testing.assert_close(slope, expected, rtol=1e-6, atol=1e-8)
-    torch.testing.assert_close(model.predicted, predict(samples, material, SHARED), rtol=1e-12, atol=1e-14)
+    torch.testing.assert_close(model.predicted, predict(samples, material, shared), rtol=1e-12, atol=1e-14)
 
 
-@pytest.mark.parametrize("index", range(len(GLOBALS)), ids=GLOBALS)
-def test_derivative_by_a_shared_parameter_is_the_central_difference_at_the_displayed_color(index):
+@pytest.mark.parametrize(
+    "scene, index",
+    [(scene, index) for scene in SCENES for index in range(len(shared_of(scene).vector))],
+    ids=lambda value: BOUNCE_GLOBALS[value] if isinstance(value, int) else value,
+)
+def test_derivative_by_a_shared_parameter_is_the_central_difference_at_the_displayed_color(scene, index):
     """What is fitted is b^γ: as γ moves, b moves with it."""
-    samples, material = made_samples(300, 17), made_materials(300)
-    step = torch.zeros(5, dtype=torch.float64)
+    samples, material, shared = SCENES[scene](made_samples(300, 17)), made_materials(300), shared_of(scene)
+    step = torch.zeros(len(shared.vector), dtype=torch.float64)
     step[index] = 1e-6
 
     def shown(vector: torch.Tensor) -> torch.Tensor:
         moved = Globals(vector)
-        color = material[:, :3] ** (SHARED.gamma / moved.gamma)
+        color = material[:, :3] ** (shared.gamma / moved.gamma)
         return predict(samples, torch.cat([color, material[:, 3:]], dim=1), moved)
 
-    slope = (shown(SHARED.vector + step) - shown(SHARED.vector - step)) / 2e-6
+    slope = (shown(shared.vector + step) - shown(shared.vector - step)) / 2e-6
     torch.testing.assert_close(
-        slope, linearise(samples, material, SHARED).by_globals[..., index], rtol=1e-6, atol=1e-8
+        slope, linearise(samples, material, shared).by_globals[..., index], rtol=1e-6, atol=1e-8
     )
 
 

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from endotwin.fit.samples import Samples
-from endotwin.fit.start import PRIOR, closed_form
+from endotwin.fit.start import ALBEDO_MIDDLE, PRIOR, closed_form
 
 VERTICES = 400
 GAMMA, CONE, FALLOFF = 0.40, 1.6, 2.25
@@ -39,6 +39,8 @@ def diffuse_samples(
         log_cos_axis=torch.from_numpy(np.log(cos_axis)).float(),
         log_distance=torch.from_numpy(np.log(distance)).float(),
         color=torch.from_numpy(np.uint8(shown * 255 + 0.5)),
+        frame=torch.arange(count, dtype=torch.int32),
+        pixel=torch.zeros(count, dtype=torch.int32),
     ), albedo
 
 
@@ -69,7 +71,7 @@ def test_light_and_albedo_share_the_scale_that_reproduces_the_photos():
     truth = np.median(albedo) * 300 / far**FALLOFF
     got = np.median(start.base_color) * start.light.L0 / far**start.light.q
     assert got == pytest.approx(truth, rel=0.05)
-    assert np.percentile(start.base_color.max(axis=1), 98) == pytest.approx(0.8, rel=1e-4)
+    assert np.median(start.base_color.max(axis=1)) == pytest.approx(ALBEDO_MIDDLE, rel=1e-4)
 
 
 def test_one_distance_and_one_axis_angle_leave_cone_and_falloff_at_the_prior_and_say_so():

@@ -112,21 +112,11 @@ def test_cells_shrink_by_the_growth_from_the_coarsest_to_no_less_than_the_finest
     assert len(HashGrid(1.0, 5.0).cells_mm) == 1
 
 
-def test_adopting_keeps_the_rows_that_two_operators_share_and_zeroes_the_rest(points, operator):
-    finer = HashOperator.of(points[:100] + 0.3, HashGrid(9.0, 0.3, 1.7, GRID.log2_slots))
-    table = random_table(operator)
-    theirs = dict(zip(zip(operator.level, operator.slot, strict=True), table, strict=True))
-    adopted = finer.adopt(torch.from_numpy(table), operator).numpy()
-    mine = list(zip(finer.level, finer.slot, strict=True))
-    shared = [pair in theirs for pair in mine]
-    assert 0 < sum(shared) < len(mine)
-    for row, pair in zip(adopted, mine, strict=True):
-        np.testing.assert_array_equal(row, theirs.get(pair, np.zeros(3)))
-
-
-def test_a_table_fitted_on_all_points_gives_the_same_features_where_an_operator_of_some_adopts_it(
-    points, operator
-):
+def test_a_table_says_at_other_points_what_an_operator_of_theirs_would(points, operator):
+    """Where both have a row; a corner that no fitted point touched counts as 0."""
     table = torch.from_numpy(random_table(operator))
-    some = HashOperator.of(points[:50], GRID)
-    np.testing.assert_allclose(some(some.adopt(table, operator)), operator(table)[:50], atol=1e-6)
+    np.testing.assert_allclose(operator.at(points, table), operator(table), atol=1e-5)
+    elsewhere = np.array([[1e4, 1e4, 1e4]])
+    some = HashOperator.of(points[:1], GRID)
+    assert some.at(points[:1], torch.from_numpy(random_table(some))).abs().max() > 0
+    assert not HashOperator.of(points[:1], HashGrid(9.0, 9.0)).at(elsewhere, torch.ones(8, 3)).any()

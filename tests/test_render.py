@@ -114,6 +114,22 @@ def test_pixels_off_the_surface_are_black_without_depth_or_normal(plane):
     assert not view.normals[~inside].any()
 
 
+def test_a_slit_narrower_than_a_pixel_is_no_black_line(plane):
+    column, row = 40, 30
+    slope, beside = (
+        CAMERA.pixel_directions[row, c, 0] / CAMERA.pixel_directions[row, c, 2] for c in (column, column + 1)
+    )
+    slit_mm = PLANE_MM * (slope + 0.2 * np.array([-1, 1]) * (beside - slope))
+    left, right = (plane.vertices_mm + plane.origin_mm - CENTRE_MM for _ in range(2))
+    left[left[:, 0] > 0, 0], right[right[:, 0] < 0, 0] = slit_mm
+    vertices = np.concatenate([left, right]) + CENTRE_MM
+    triangles = np.concatenate([plane.triangles, plane.triangles + 4])
+    slit = Surface.from_mesh(vertices, triangles, np.tile([0, 0, -1.0], (8, 1)))
+    view = Renderer(twin_of(slit)).view(at_centre())
+    assert not view.mask[row, column] and view.mask[row, column + 1]
+    np.testing.assert_allclose(view.color[row, column], view.color[row, column + 1], rtol=0.05)
+
+
 def test_a_mask_limits_the_view_and_changes_nothing_within(sphere):
     renderer = Renderer(twin_of(sphere))
     whole = renderer.view(at_centre())

@@ -77,6 +77,16 @@ def test_what_is_no_twin_is_said_to_be_none(tmp_path):
             Twin.load(path)
 
 
+def test_a_file_of_a_twin_is_not_the_twin(twin, tmp_path):
+    twin.save(tmp_path / "twin")
+    with pytest.raises(TwinError, match="is a file; give the folder"):
+        Twin.load(tmp_path / "twin" / "twin.json")
+
+
+def test_a_twin_whose_scores_could_not_be_measured_prints_none(twin):
+    assert "held out" not in repr(twin.with_record(eval={"psnr": None, "ssim": None}))
+
+
 @pytest.mark.parametrize("text", ("", "{", "[]", "{}", "null", '"twin"'))
 def test_an_unreadable_document_names_its_file(twin, tmp_path, text):
     twin.save(tmp_path / "twin")

@@ -14,6 +14,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
+import scipy.linalg
 import torch
 from torch import Tensor
 
@@ -47,31 +48,37 @@ GLOBAL_MEAN = (
     PRIOR["gamma"] * PRIOR["q"],
     PRIOR["gamma"],
     math.log(F0_DIELECTRIC),
+    0.0,
 )
-GLOBAL_SPREAD = (5.0, 0.5, 0.25, 0.1, 0.5)
-GLOBAL_RANGE = ((-20.0, 20.0), (0.0, 10.0), (0.0, 4.0), (0.15, 1.5), (-6.0, -0.7))
-"""Prior and bounds of the shared parameters, in the order of GLOBALS."""
+GLOBAL_SPREAD = (5.0, 0.5, 0.25, 0.1, 0.5, 0.5)
+GLOBAL_RANGE = ((-20.0, 20.0), (0.0, 10.0), (0.0, 4.0), (0.15, 1.5), (-6.0, -0.7), (-1.5, 1.5))
+"""Prior and bounds of the shared parameters, in the order of BOUNCE_GLOBALS."""
 
 COLOR_RANGE = (1e-3, 2.0)
 
 CG_TOLERANCE = 1e-3
 CG_STEPS = 25
 SEARCH_SAMPLES = 300_000
+LENGTHS = (1.0, 0.5, 0.25, 0.1)
+"""Of the line search, as shares of the full step."""
 
 
 @dataclass(frozen=True)
 class State:
-    """What is fitted: table [R, 4] of one operator, its mean [4], and the shared parameters."""
+    """What is fitted: table [R, 4] of one operator, its mean [4] or [V, 4], and the shared parameters.
 
-    operator: HashOperator
+    Without an operator the mean is all there is.
+    """
+
+    operator: HashOperator | None
     mean: Tensor
-    table: Tensor
+    table: Tensor | None
     shared: Globals
 
     @property
     def raw(self) -> Tensor:
         """θ = θ̄ + A·table, [V, 4]."""
-        return self.mean + self.operator(self.table)
+        return self.mean if self.operator is None else self.mean + self.operator(self.table)
 
     @property
     def materials(self) -> Tensor:
@@ -105,9 +112,9 @@ def roughness_to_raw(roughness: float) -> float:
     return float(np.log(share / (1 - share)))
 
 
-def prior_precision(operator: HashOperator) -> Tensor:
+def prior_precision(operator: HashOperator, unit_mm: float) -> Tensor:
     """Inverse prior variance of each table entry, float32 [R, 4]."""
-    cell = torch.from_numpy(operator.cells_mm[operator.level] / COARSE_MM).float()
+    cell = torch.from_numpy(operator.cells_mm[operator.level] / (unit_mm * COARSE_MM)).float()
     low, high = ROUGHNESS_RANGE
     link = (high - low) / 4
     color = 1 / (COLOR_SPREAD**2 * cell)
@@ -118,15 +125,36 @@ def prior_precision(operator: HashOperator) -> Tensor:
 class GaussNewton:
     """Steps on one set of samples with one operator."""
 
-    def __init__(self, samples: Samples, triangles: np.ndarray, operator: HashOperator, seed: int = 0):
+    def __init__(
+        self,
+        samples: Samples,
+        triangles: np.ndarray,
+        operator: HashOperator,
+        unit_mm: float = 1.0,
+        held: tuple[str, ...] = (),
+        seed: int = 0,
+        out_of_time: Callable[[], bool] = lambda: False,
+        cg_steps: int = CG_STEPS,
+    ):
         vertex_count = operator.forward_csr.shape[0]
-        self.samples = samples
         self.triangles = torch.from_numpy(triangles.astype(np.int64))
         self.pattern = MeshPattern(samples, triangles, vertex_count)
         self.operator = operator
-        self.precision = prior_precision(operator)
-        self.trial = samples.thinned(SEARCH_SAMPLES, np.random.default_rng(seed))
+        self.precision = prior_precision(operator, unit_mm)
+        self._unit_mm = unit_mm
+        self.held = held
+        self.out_of_time = out_of_time
+        self.cg_steps = cg_steps
+        self._trial_rows = _drawn(len(samples), SEARCH_SAMPLES, seed)
+        self.relight(samples)
         self.squared_adjoint = _squared(operator.adjoint_csr)
+
+    def relight(self, samples: Samples) -> None:
+        """Go on with the same samples under other light or exposure."""
+        self.samples, self.trial = samples, samples[self._trial_rows]
+
+    def _global_prior(self, state: State) -> tuple[Tensor, Tensor]:
+        return _global_prior(self._unit_mm, len(state.shared.vector))
 
     def noise(self, state: State) -> float:
         """Robust standard deviation of the residual, in display values."""
@@ -138,7 +166,7 @@ class GaussNewton:
         share = len(self.samples) / max(1, len(self.trial))
         data = robust_cost(self.trial, self._predict(state), HUBER * noise) * share / (noise**2 * TEMPER)
         prior = float((self.precision * state.table**2).double().sum()) / 2
-        mean, spread = _global_prior()
+        mean, spread = self._global_prior(state)
         return data + prior + float((((state.shared.vector - mean) / spread) ** 2).sum()) / 2
 
     def step(self, state: State, joint: bool = True) -> tuple[State, float]:
@@ -154,11 +182,11 @@ class GaussNewton:
         )
         table_step, shared_step = self._solve(state, equations, scale, joint)
         before = self.cost(state, noise)
-        for length in (1.0, 0.5, 0.25, 0.1):
+        for length in LENGTHS:
             moved = replace(
                 state,
                 table=state.table + length * table_step,
-                shared=_bounded(state.shared.vector + length * shared_step),
+                shared=_bounded(state.shared, state.shared.vector + length * shared_step),
             )
             after = self.cost(moved, noise)
             if after < before:
@@ -172,7 +200,7 @@ class GaussNewton:
         self, state: State, equations: NormalEquations, scale: float, joint: bool
     ) -> tuple[Tensor, Tensor]:
         link = state.link_slope[..., None]
-        mean, spread = _global_prior()
+        mean, spread = self._global_prior(state)
 
         def product(x: Tensor) -> Tensor:
             rows, _, columns = x.shape
@@ -181,22 +209,47 @@ class GaussNewton:
             back = self.operator.adjoint_csr @ vertex.reshape(len(vertex), -1)
             return back.reshape(rows, CHANNELS, columns) + self.precision[..., None] * x
 
-        right = (equations.right[..., : None if joint else 1] * link * scale).reshape(len(link), -1)
+        free = free_directions(state.shared, self.held) if joint else np.zeros((len(spread), 0))
+        right = torch.cat(
+            [equations.right[..., :1], equations.right[..., 1:] @ torch.from_numpy(free).float()], 2
+        )
+        right = (right * link * scale).reshape(len(link), -1)
         right = (self.operator.adjoint_csr @ right).reshape(len(state.table), CHANNELS, -1)
         right[..., 0] -= self.precision * state.table
         block = equations.lumped() * (link * link.transpose(1, 2)) * scale
         block = (self.squared_adjoint @ block.reshape(len(link), -1)).reshape(-1, CHANNELS, CHANNELS)
         inverse = torch.linalg.inv(block + torch.diag_embed(self.precision))
-        solved = conjugate_gradients(product, right, inverse)
+        solved = conjugate_gradients(product, right, inverse, self.out_of_time, self.cg_steps)
 
         if not joint:
             return solved[..., 0], torch.zeros_like(spread)
         pull = ((mean - state.shared.vector) / spread**2).numpy()
         shared_normal = equations.shared * scale + np.diag(1 / spread.numpy() ** 2)
-        weights, shared_step = _joint_minimum(
-            solved, product(solved), right, shared_normal, equations.shared_right * scale + pull
+        shared_right = free.T @ (equations.shared_right * scale + pull)
+        weights, along = _joint_minimum(
+            solved, product(solved), right, free.T @ shared_normal @ free, shared_right
         )
-        return solved @ torch.from_numpy(weights).float(), torch.from_numpy(shared_step)
+        return solved @ torch.from_numpy(weights).float(), torch.from_numpy(free @ along)
+
+
+def free_directions(shared: Globals, held: tuple[str, ...]) -> np.ndarray:
+    """Steps of the shared parameters that keep those named in ``held`` (L0, n, q, gamma, albedo scale): a
+    basis [G, K].
+
+    The light is fitted as γ·ln L0, γ·n and γ·q: γn − n·γ = 0 keeps n while γ moves.
+    """
+    log_L0, n, q = shared.log_light
+    kept = {
+        "L0": [1, 0, 0, -log_L0, 0, 0],
+        "n": [0, 1, 0, -n, 0, 0],
+        "q": [0, 0, 1, -q, 0, 0],
+        "gamma": [0, 0, 0, 1, 0, 0],
+        "albedo scale": [0, 0, 0, 0, 0, 1],
+    }
+    count = len(shared.vector)
+    if not held:
+        return np.eye(count)
+    return scipy.linalg.null_space(np.array([kept[name][:count] for name in held]))
 
 
 def _joint_minimum(
@@ -223,35 +276,64 @@ def _joint_minimum(
     return solution[:columns], solution[columns:]
 
 
-def conjugate_gradients(product: Callable[[Tensor], Tensor], right: Tensor, inverse: Tensor) -> Tensor:
-    """Solve for all right-hand sides [R, C, K] at once, preconditioned by blocks ``inverse`` [R, C, C]."""
+def conjugate_gradients(
+    product: Callable[[Tensor], Tensor],
+    right: Tensor,
+    inverse: Tensor,
+    out_of_time: Callable[[], bool] = lambda: False,
+    steps: int = CG_STEPS,
+) -> Tensor:
+    """Solve for all right-hand sides [R, C, K] at once, preconditioned by blocks ``inverse`` [R, C, C].
+
+    Ended early, when ``out_of_time`` says so, it still gives a step that descends.
+    """
     x = torch.zeros_like(right)
     residual = right.clone()
     z = inverse @ residual
     direction = z.clone()
     energy = (residual * z).sum(dim=(0, 1))
     goal = CG_TOLERANCE**2 * energy
-    for _ in range(CG_STEPS):
+    for _ in range(steps):
         image = product(direction)
         length = energy / (direction * image).sum(dim=(0, 1)).clamp_min(1e-30)
         x += length * direction
         residual -= length * image
         z = inverse @ residual
         renewed = (residual * z).sum(dim=(0, 1))
-        if (renewed <= goal).all():
+        if (renewed <= goal).all() or out_of_time():
             break
         direction = z + (renewed / energy.clamp_min(1e-30)) * direction
         energy = renewed
     return x
 
 
-def _global_prior() -> tuple[Tensor, Tensor]:
-    return torch.tensor(GLOBAL_MEAN, dtype=torch.float64), torch.tensor(GLOBAL_SPREAD, dtype=torch.float64)
+def _global_prior(unit_mm: float, count: int) -> tuple[Tensor, Tensor]:
+    """Mean and standard deviation of ``count`` shared parameters; L0 is the light at a distance of 1 mm,
+    but its prior that at 1 unit."""
+    mean, spread = (
+        torch.tensor(values[:count], dtype=torch.float64) for values in (GLOBAL_MEAN, GLOBAL_SPREAD)
+    )
+    mean[0] += mean[2] * math.log(unit_mm)
+    return mean, spread
 
 
-def _bounded(vector: Tensor) -> Globals:
-    limits = torch.tensor(GLOBAL_RANGE, dtype=torch.float64)
-    return Globals(torch.clamp(vector, limits[:, 0], limits[:, 1]))
+def at_bounds(shared: Globals) -> list[str]:
+    """Which of n, q and gamma lie on an edge of their range."""
+    told = {"n": 1, "q": 2, "gamma": 3}
+    return [name for name, index in told.items() if float(shared.vector[index]) in GLOBAL_RANGE[index]]
+
+
+def _bounded(shared: Globals, vector: Tensor) -> Globals:
+    limits = torch.tensor(GLOBAL_RANGE, dtype=torch.float64)[: len(vector)]
+    return replace(shared, vector=torch.clamp(vector, limits[:, 0], limits[:, 1]))
+
+
+def _drawn(count: int, wanted: int, seed: int) -> Tensor:
+    """About ``wanted`` of ``count`` rows, ascending; all if there are no more."""
+    if count <= wanted:
+        return torch.arange(count)
+    chosen = np.random.default_rng(seed).random(count, np.float32) < wanted / count
+    return torch.from_numpy(np.flatnonzero(chosen))
 
 
 def _squared(matrix: Tensor) -> Tensor:

@@ -2,7 +2,7 @@
 
 Each pixel touches the three vertices of its triangle, so the normal matrix of a material channel has the
 sparsity of the mesh. Base colours of different channels do not meet; roughness meets all three. Shared
-parameters (GLOBALS) border it.
+parameters border it.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import scipy.sparse
 import torch
 from torch import Tensor
 
-from endotwin.fit.model import GLOBALS, Globals, at_pixels, linearise
+from endotwin.fit.model import Globals, at_pixels, linearise
 from endotwin.fit.samples import Samples
 from endotwin.hashgrid import to_torch
 
@@ -95,8 +95,8 @@ class NormalEquations:
     Attributes:
         color: three CSR [V, V], base colour by base colour. mixed: three CSR, base colour by roughness.
         roughness: CSR [V, V].
-        right: float32 [V, 4, 1 + 5], JᵀW(e | dC/dGLOBALS) by channel.
-        shared: float64 [5, 5] and shared_right [5], those of GLOBALS.
+        right: float32 [V, 4, 1 + G], JᵀW(e | dC by the G shared parameters) by channel.
+        shared: float64 [G, G] and shared_right [G], those of the shared parameters.
     """
 
     color: list[Tensor]
@@ -133,10 +133,10 @@ def assemble(
     width: float,
 ) -> NormalEquations:
     """Linearise at vertex ``materials`` [V, 4] and ``shared``, and sum over the samples."""
-    count = len(pattern.corners)
+    count, globals_count = len(pattern.corners), len(shared.vector)
     pair_sums = np.zeros((7, count, len(CORNER_PAIRS)), np.float32)
-    corner_sums = np.zeros((count, 3, CHANNELS * (1 + len(GLOBALS))), np.float32)
-    normal, right = np.zeros((len(GLOBALS),) * 2), np.zeros(len(GLOBALS))
+    corner_sums = np.zeros((count, 3, CHANNELS * (1 + globals_count)), np.float32)
+    normal, right = np.zeros((globals_count,) * 2), np.zeros(globals_count)
     for start, part in zip(range(0, len(samples), CHUNK), samples.chunks(CHUNK), strict=True):
         model = linearise(part, at_pixels(part, triangles, materials), shared)
         residual = Residual.of(part, model.predicted, width)
@@ -171,7 +171,7 @@ def assemble(
         color=matrices[:3],
         mixed=matrices[3:6],
         roughness=matrices[6],
-        right=torch.from_numpy(vertex).reshape(-1, CHANNELS, 1 + len(GLOBALS)),
+        right=torch.from_numpy(vertex).reshape(-1, CHANNELS, 1 + globals_count),
         shared=normal,
         shared_right=right,
     )

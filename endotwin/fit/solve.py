@@ -8,40 +8,54 @@ from all pixels.
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+import math
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 
+from endotwin.casting import Caster
+from endotwin.effects import Decision, Effects
+from endotwin.effects.decide import decide
+from endotwin.effects.price import priced
 from endotwin.errors import SequenceError
-from endotwin.fit.gauss_newton import ROUGHNESS_MEAN, GaussNewton, State, roughness_to_raw
+from endotwin.fit.gauss_newton import ROUGHNESS_MEAN, GaussNewton, State, at_bounds, roughness_to_raw
+from endotwin.fit.lighting import Relighting, lit
 from endotwin.fit.model import Globals
-from endotwin.fit.samples import Samples, gather
-from endotwin.fit.start import ALBEDO_TOP, BRIGHT, Start, closed_form
+from endotwin.fit.pace import ITERATIONS, LIGHT, Pace
+from endotwin.fit.samples import THREADS, Samples, gather
+from endotwin.fit.start import ALBEDO_TOP, BRIGHT, Start, closed_form, start_at
+from endotwin.fit.tilt import tilted
+from endotwin.fit.unit import unit_mm
 from endotwin.hashgrid import HashGrid, HashOperator
 from endotwin.shading import F0_DIELECTRIC
-from endotwin.stopwatch import Stopwatch
 from endotwin.surface import Surface
 from endotwin.twin import Light, Materials, Response, Twin
 
 logger = logging.getLogger("endotwin")
 
-Progress = Callable[[str, int, int], None]
-
 LIGHT_CELL_MM = 1.6
-LIGHT_GRID = HashGrid(coarsest_mm=12.0, finest_mm=LIGHT_CELL_MM)
-"""The features beside which light and response are found."""
+LIGHT_COARSEST_MM = 12.0
+"""Cells of the features beside which light and response are found, in units of the scene."""
 
 LIGHT_PIXELS, LIGHT_STEPS = 400_000, 4
-DETAIL_EDGES = 1.0
-"""Edge of the finest hash cell in mesh edges: finer features would say nothing that a vertex can hold."""
+LIGHT_CG_STEPS = 80
+"""Solved less exactly, the joint steps stop at values of γ that differ by 4 % from seed to seed."""
+
+HOLD_STEPS, RELIGHT_STEPS = 1, 14
+"""Steps where the light depends on the materials and is renewed at each."""
+
+LIGHT_SHARE = 0.25
+"""Of fewer pixels than it takes to find LIGHT_PIXELS, this share."""
 
 DETAIL_GROWTH = 1.6
 DETAIL_COARSEST_MM = 2.56
 """Coarsest cell that detail may correct: the light's pixels leave out the creases."""
 
-DETAIL_PIXELS, DETAIL_STEPS = 4_000_000, 2
+ASSEMBLY = 0.4
+"""Share of the time left for the detail that summing over its pixels may take."""
+
 PROXIES = 4
 """Vertices are merged to so many points a finest cell while only coarse features are fitted."""
 
@@ -53,49 +67,88 @@ CONVERGED = 2e-4
 
 
 @dataclass(frozen=True)
-class _Clock:
-    """Clock and reporting of one fit."""
+class _Cost:
+    """What the light's stage took, from which to tell what the detail's will.
 
-    stopwatch: Stopwatch
-    budget_s: float | None
-    report: Progress | None
+    Attributes:
+        setup_s, step_s: seconds of the operator and the solver, and of a step without the light.
+        weights: hash weights of its points. pixels: samples that the step summed over.
+    """
 
-    def allows(self, seconds: float) -> bool:
-        """Whether so many seconds more stay within the budget."""
-        return self.budget_s is None or self.stopwatch.total + seconds <= self.budget_s
+    setup_s: float
+    step_s: float
+    weights: int
+    pixels: int
 
 
-def fit_twin(twin: Twin, budget_s: float | None, seed: int, progress: Progress | None = None) -> Twin:
-    """Fit as the module says. ``budget_s`` bounds the seconds: steps that would pass it are left out.
+def fit_twin(twin: Twin, pace: Pace, seed: int, states: Mapping[str, str]) -> Twin:
+    """Fit as the module says, in the time that ``pace`` gives, with effects as ``states`` say (auto unless
+    named).
 
     Raises:
         SequenceError: the training photos show nothing of the surface.
     """
-    stopwatch = Stopwatch()
-    clock = _Clock(stopwatch, budget_s, progress)
-    surface = twin.surface
+    surface, stopwatch = twin.surface, pace.stopwatch
     with stopwatch.stage("gather"):
-        samples = gather(twin, DETAIL_PIXELS, seed, progress)
+        caster = Caster(surface, threads=1)
+        samples = gather(twin, pace, seed, caster)
     if not len(samples):
         raise SequenceError(
             f"the training photos of {twin.source.path} show nothing of the surface; "
             "check that poses and depth fit it"
         )
     with stopwatch.stage("start"):
-        telling = samples[torch.from_numpy(np.flatnonzero(_telling(samples, surface)))]
-        telling = telling if len(telling) else samples
-        start = closed_form(telling, surface.triangles, len(surface.vertices_mm))
+        telling = np.flatnonzero(_telling(samples, surface))
+        if not len(telling):
+            telling = np.arange(len(samples))
+            if int(samples.color.max(dim=1).values.min()) >= BRIGHT:
+                logger.warning(
+                    "no training photo of %s has an unclipped pixel: its light and materials are guesses",
+                    twin.source.path,
+                )
+        telling = torch.from_numpy(_thinned(telling, pace.start_pixels, seed))
+        start = closed_form(samples[telling], surface.triangles, len(surface.vertices_mm))
     if start.undetermined:
         logger.warning("the photos cannot tell %s: kept at the prior", " and ".join(start.undetermined))
+    with stopwatch.stage("effects"):
+        caster = caster.threaded(THREADS)
+        decided = decide(samples[telling], twin, caster, states)
+        relighting = Relighting(twin, caster, decided.effects, np.unique(samples.frame.numpy()))
+        if decided.light is not None:
+            start = start_at(
+                samples[telling],
+                surface.triangles,
+                len(surface.vertices_mm),
+                decided.light,
+                decided.gamma,
+            )
+        samples = lit(samples, twin, caster, decided.effects)
     with stopwatch.stage("light"):
-        state, step_s = _find_light(
-            telling.thinned(LIGHT_PIXELS, np.random.default_rng(seed)), surface, start, clock
-        )
+        count = min(LIGHT_PIXELS, int(LIGHT_SHARE * pace.start_pixels))
+        rows = torch.from_numpy(_thinned(telling.numpy(), count, seed))
+        state, cost = _find_light(samples[rows], surface, start, pace, relighting)
     with stopwatch.stage("detail"):
-        state = _find_detail(samples, surface, state, step_s, clock)
-    return _fitted(twin, state).with_record(
+        state, normals = _find_detail(samples, twin, state, cost, pace, relighting)
+        twin = replace(twin, surface=replace(surface, normals=normals))
+    stuck = at_bounds(state.shared)
+    if stuck:
+        logger.warning(
+            "the fit ended at the bound of %s, as it does on wrong poses, depth or photos: do not trust it; "
+            "'endotwin check %s' looks for the cause",
+            *(" and ".join(stuck), twin.source.path),
+        )
+    with stopwatch.stage("price"):
+        fitted = priced(_fitted(twin, state, relighting.effects, decided.decisions), caster)
+    return fitted.with_record(
         fit={"method": "twin", "undetermined": list(start.undetermined), **stopwatch.to_dict()}
     )
+
+
+def _thinned(rows: np.ndarray, count: int, seed: int) -> np.ndarray:
+    """About ``count`` of ``rows`` [N], drawn evenly at random in their order; all if there are no more."""
+    if len(rows) <= count:
+        return rows
+    return rows[np.random.default_rng(seed).random(len(rows), np.float32) < count / len(rows)]
 
 
 def _telling(samples: Samples, surface: Surface) -> np.ndarray:
@@ -104,58 +157,97 @@ def _telling(samples: Samples, surface: Surface) -> np.ndarray:
     return smooth[samples.triangle.numpy()] & (samples.color.numpy().max(axis=1) < BRIGHT)
 
 
-def _find_light(samples: Samples, surface: Surface, start: Start, clock: _Clock) -> tuple[State, float]:
-    """Light, response, f0 and coarse materials; and the seconds that a step without the light takes."""
-    points, group = proxies(surface.vertices_mm, LIGHT_CELL_MM / PROXIES)
-    operator = HashOperator.of(points, LIGHT_GRID)
-    solver = GaussNewton(samples, group[surface.triangles], operator)
+def _find_light(
+    samples: Samples, surface: Surface, start: Start, pace: Pace, relighting: Relighting
+) -> tuple[State, _Cost]:
+    """Light, response, f0 and coarse materials; and what they cost."""
+    unit = unit_mm(surface)
+    points, group = proxies(surface.vertices_mm, unit * LIGHT_CELL_MM / PROXIES)
+    began = pace.stopwatch.total
+    operator = HashOperator.of(points, _light_grid(unit))
+    solver = GaussNewton(
+        samples,
+        group[surface.triangles],
+        operator,
+        unit,
+        start.undetermined,
+        out_of_time=pace.light_is_over,
+        cg_steps=LIGHT_CG_STEPS,
+    )
     shown = torch.from_numpy(start.base_color) ** start.response.gamma
     mean = torch.cat([shown.median(dim=0).values, torch.tensor([roughness_to_raw(ROUGHNESS_MEAN)])])
     table = torch.zeros(operator.forward_csr.shape[1], 4)
-    state = State(operator, mean, table, Globals.of(start.light, start.response, F0_DIELECTRIC))
-    before = clock.stopwatch.total
+    effects = relighting.effects
+    options = {"specular": "specular" in effects, "bounce": "interreflection" in effects}
+    shared = Globals.of(start.light, start.response, F0_DIELECTRIC, **options)
+    state = State(operator, mean, table, shared)
+    relighting(solver, state)
+    ready = pace.stopwatch.total
     state, _ = solver.step(state, joint=False)
-    step_s = clock.stopwatch.total - before
-    for number in range(LIGHT_STEPS):
-        if not clock.allows(2 * step_s):
+    step_s = pace.stopwatch.total - ready
+    steps = RELIGHT_STEPS if relighting.needed else LIGHT_STEPS
+    for number in range(steps):
+        if pace.left(LIGHT) <= 2 * step_s:
             break
+        relighting(solver, state)
+        solver.held = start.undetermined
+        if "interreflection" in effects:
+            solver.held += ("L0",) + ("albedo scale",) * (number < HOLD_STEPS)
         state, gain = solver.step(state)
-        if clock.report:
-            clock.report("find the light", number + 1, LIGHT_STEPS)
+        pace.report("find the light", number + 1, steps)
         if gain < CONVERGED * solver.cost(state, solver.noise(state)):
             break
-    return state, step_s * len(surface.vertices_mm) / len(points)
+    return state, _Cost(ready - began, step_s, len(points) * len(operator.cells_mm), len(samples))
 
 
-def _find_detail(samples: Samples, surface: Surface, state: State, step_s: float, clock: _Clock) -> State:
-    """The state with finer features on top, as fine as the mesh; light, response and the coarse features
-    stay.
+def _find_detail(
+    samples: Samples, twin: Twin, state: State, cost: _Cost, pace: Pace, relighting: Relighting
+) -> tuple[State, np.ndarray]:
+    """The state with finer features on top, and normals [V, 3] tilted as the photos show; light, response
+    and the coarse features stay.
+
+    They are as fine as the mesh: finer ones would say nothing that a vertex can hold. Where there is no time
+    for hash features, each vertex has a value of its own: those lack only what vertices learn from others.
     """
-    finest_mm = DETAIL_EDGES * median_edge_mm(surface)
-    if finest_mm > DETAIL_COARSEST_MM:
-        return _at_vertices(state, surface)
-    operator = HashOperator.of(surface.vertices_mm, HashGrid(DETAIL_COARSEST_MM, finest_mm, DETAIL_GROWTH))
-    table = torch.zeros(operator.forward_csr.shape[1], 4)
-    state = State(operator, _at_vertices(state, surface).raw, table, state.shared)
-    step_s = step_s + 2e-6 * len(samples)
-    if not clock.allows(step_s):
-        return state
-    solver = GaussNewton(samples, surface.triangles, operator)
-    for number in range(DETAIL_STEPS):
-        if not clock.allows(step_s):
+    surface = twin.surface
+    unit, normals = unit_mm(surface), surface.normals
+    at_vertices = state.mean + state.operator.at(surface.vertices_mm, state.table)
+    state = State(None, at_vertices, None, state.shared)
+    finest_mm, coarsest_mm = pace.plan.detail * median_edge_mm(surface), unit * DETAIL_COARSEST_MM
+    grid = HashGrid(coarsest_mm, finest_mm, DETAIL_GROWTH)
+    setup_s = cost.setup_s * len(surface.vertices_mm) * len(grid.cells_mm) / cost.weights
+    left_s = pace.left(ITERATIONS)
+    if finest_mm > coarsest_mm or not pace.plan.steps or left_s <= cost.step_s / 2:
+        return state, normals
+    if np.isfinite(left_s):
+        assembly_s = ASSEMBLY * (left_s - setup_s if left_s > 2 * setup_s else left_s)
+        count = int(cost.pixels * assembly_s / cost.step_s)
+        samples = samples.thinned(count, np.random.default_rng(len(samples)))
+    if left_s > 2 * setup_s:
+        operator = HashOperator.of(surface.vertices_mm, grid)
+    else:
+        operator = HashOperator.each(len(surface.vertices_mm), finest_mm)
+    state = State(operator, at_vertices, torch.zeros(operator.forward_csr.shape[1], 4), state.shared)
+    solver = GaussNewton(samples, surface.triangles, operator, unit, out_of_time=pace.out_of_time)
+    step_s = 0.0
+    for number in range(pace.plan.steps):
+        if pace.left(ITERATIONS) <= step_s / 2:
             break
-        before = clock.stopwatch.total
+        before = pace.stopwatch.total
+        relighting(solver, state)
         state, _ = solver.step(state, joint=False)
-        step_s = clock.stopwatch.total - before
-        if clock.report:
-            clock.report("find the detail", number + 1, DETAIL_STEPS)
-    return state
+        step_s = pace.stopwatch.total - before
+        pace.report("find the detail", number + 1, pace.plan.steps)
+    for number in range(pace.plan.tilts):
+        if pace.left(ITERATIONS) <= step_s / 2:
+            break
+        normals = tilted(normals, solver, state, twin, relighting.effects)
+        pace.report("tilt the normals", number + 1, pace.plan.tilts)
+    return state, normals
 
 
-def _at_vertices(state: State, surface: Surface) -> State:
-    """The state of the coarse features, at the vertices rather than at their proxies."""
-    operator = HashOperator.of(surface.vertices_mm, LIGHT_GRID)
-    return replace(state, operator=operator, table=operator.adopt(state.table, state.operator))
+def _light_grid(unit: float) -> HashGrid:
+    return HashGrid(unit * LIGHT_COARSEST_MM, unit * LIGHT_CELL_MM)
 
 
 def proxies(vertices_mm: np.ndarray, cell_mm: float) -> tuple[np.ndarray, np.ndarray]:
@@ -176,17 +268,19 @@ def median_edge_mm(surface: Surface) -> float:
     return float(np.median(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)))
 
 
-def _fitted(twin: Twin, state: State) -> Twin:
-    """Materials of the state, with the scale that light and albedo share fixed by ALBEDO_TOP.
+def _fitted(twin: Twin, state: State, effects: Effects, decisions: Mapping[str, Decision]) -> Twin:
+    """Materials of the state, with the scale that light and albedo share fixed by ALBEDO_TOP, or by the
+    bounce.
 
     Metallic is 0: with a white specular lobe it only scales the base colour, so photos cannot tell the two
-    apart, and
-    the published penalty λm|m| is least at 0.
+    apart, and the published penalty λm|m| is least at 0.
     """
     materials = state.materials.numpy()
     seen = twin.surface.seen_by > 0
     brightest = materials[seen if seen.any() else slice(None), :3].max(axis=1)
     scale = float(ALBEDO_TOP / np.percentile(brightest, 98))
+    if "interreflection" in effects:
+        scale = math.exp(state.shared.log_scale)
     light = state.shared.light
     return replace(
         twin,
@@ -198,4 +292,6 @@ def _fitted(twin: Twin, state: State) -> Twin:
         ),
         light=Light(light.L0 / scale, light.n, light.q),
         response=Response(state.shared.gamma),
+        effects=effects,
+        decisions=dict(decisions),
     )

@@ -29,11 +29,18 @@ HIGHLIGHT_SIN2 = 0.06
 COS_MIN = 0.1
 HUBER = 1.345
 ROUNDS = 6
-RCOND = 1e-4
-"""Singular values below this share of the largest mean that a coefficient cannot be told from the rest."""
+LEAST_TOLD = 0.015
+"""The photos do not tell a combination of γ(n − n₀), γ(q − q₀) and γ with a larger standard error: what the
+diffuse model lacks errs by several times more, and γ is known to about 0.1 beforehand."""
+
+RCOND = 1e-9
+"""Eigenvalues below this share of the largest are rounding."""
 
 ALBEDO_TOP = 0.8
 """The scale that light and albedo share is fixed by the 98th percentile of the brightest albedo channel."""
+
+ALBEDO_MIDDLE = 0.6
+"""The start fixes it by the median, since the brightest of its noisy albedos are no tissue's."""
 
 
 @dataclass(frozen=True)
@@ -57,11 +64,31 @@ def closed_form(samples: Samples, triangles: np.ndarray, vertex_count: int) -> S
     """
     vertex = triangles[samples.triangle.numpy(), samples.barycentric.argmax(dim=1).numpy()]
     gamma, n, q, undetermined = _coefficients(samples, vertex, vertex_count)
-    light = Light(1.0, n, q)
-    base_color = _albedo(samples, vertex, vertex_count, light, gamma)
-    scale = np.percentile(base_color.max(axis=1), 98) / ALBEDO_TOP
+    return _start(samples, vertex, vertex_count, Light(0.0, n, q), gamma, undetermined)
+
+
+def start_at(samples: Samples, triangles: np.ndarray, vertex_count: int, light: Light, gamma: float) -> Start:
+    """A start from a given light and response, as ``closed_form`` returns it; an L0 of 0 is chosen as
+    there."""
+    vertex = triangles[samples.triangle.numpy(), samples.barycentric.argmax(dim=1).numpy()]
+    return _start(samples, vertex, vertex_count, light, gamma, ())
+
+
+def _start(
+    samples: Samples,
+    vertex: np.ndarray,
+    vertex_count: int,
+    light: Light,
+    gamma: float,
+    undetermined: tuple[str, ...],
+) -> Start:
+    base_color = _albedo(samples, vertex, vertex_count, Light(1.0, light.n, light.q), gamma)
+    scale = light.L0 or np.median(base_color.max(axis=1)) / ALBEDO_MIDDLE
     return Start(
-        Light(float(scale), n, q), Response(gamma), (base_color / scale).astype(np.float32), undetermined
+        Light(float(scale), light.n, light.q),
+        Response(gamma),
+        (base_color / scale).astype(np.float32),
+        undetermined,
     )
 
 
@@ -71,28 +98,27 @@ def _coefficients(
     color = samples.color.numpy()
     use = (color.max(axis=1) < BRIGHT) & (color.min(axis=1) > DARK)
     use &= (samples.cos.numpy() > COS_MIN) & (samples.sin2.numpy() > HIGHLIGHT_SIN2)
-    vertex = vertex[use]
-    target = np.log(color[use].mean(axis=1, dtype=np.float64) / 255)
-    columns = np.stack(
-        [x.numpy()[use] for x in (samples.log_cos_axis, -samples.log_distance, samples.cos.log())], axis=1
-    ).astype(np.float64)
+    target = np.log(np.maximum(color, 1).mean(axis=1, dtype=np.float64) / 255)
+    columns = [x.numpy() for x in (samples.log_cos_axis, -samples.log_distance, samples.cos.log())]
+    values = np.stack([*columns, target], axis=1).astype(np.float64)[use]
+    vertex, values = _sightings(vertex[use], samples.frame.numpy()[use], values)
+    columns, target = values[:, :3], values[:, 3:]
     # Unknowns γ(n − n₀), γ(q − q₀), γ: an n or q that the data cannot tell stays at its prior n₀, q₀.
     columns[:, 2] += columns[:, :2] @ [PRIOR["n"], PRIOR["q"]]
     prior = np.array([0.0, 0.0, PRIOR["gamma"]])
-    weight, coefficients, told = np.ones(len(target)), prior, np.zeros(3, bool)
+    weight, change, told = np.ones(len(target)), np.zeros(3), np.zeros(3, bool)
     for _ in range(ROUNDS if len(target) > 3 else 0):
         centred = _without_vertex_means(columns, weight, vertex, count)
-        residual = _without_vertex_means(target[:, None], weight, vertex, count)[:, 0] - centred @ prior
-        change, told = _truncated_solve(
-            (centred * weight[:, None]).T @ centred, centred.T @ (weight * residual)
-        )
-        coefficients = prior + change
+        residual = _without_vertex_means(target, weight, vertex, count)[:, 0] - centred @ prior
         left = np.abs(residual - centred @ change)
         width = max(1.4826 * np.median(left), 1e-9)
         weight = np.minimum(1, HUBER * width / np.maximum(left, 1e-12))
+        weighted = centred * weight[:, None]
+        change, told = _told_change(weighted.T @ centred, weighted.T @ residual, width)
+    coefficients = prior + change
     gamma = float(coefficients[2])
     if not 0.1 < gamma < 2:
-        return PRIOR["gamma"], PRIOR["n"], PRIOR["q"], ("gamma", "n", "q")
+        return PRIOR["gamma"], PRIOR["n"], PRIOR["q"], ("n", "q", "gamma")
     names = tuple(name for name, known in zip(("n", "q", "gamma"), told, strict=True) if not known)
     return (
         gamma,
@@ -100,6 +126,18 @@ def _coefficients(
         float(np.clip(PRIOR["q"] + coefficients[1] / gamma, 0, 6)),
         names,
     )
+
+
+def _sightings(vertex: np.ndarray, frame: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The vertex [S] and the mean ``values`` [S, K] of each sighting: a vertex's pixels [N] in one photo.
+
+    What varies among those is where about the vertex they lie: there, light and texture look alike.
+    """
+    key, which, pixels = np.unique(
+        vertex.astype(np.int64) << 32 | frame, return_inverse=True, return_counts=True
+    )
+    means = [np.bincount(which, column, len(key)) / pixels for column in values.T]
+    return key >> 32, np.stack(means, axis=1)
 
 
 def _without_vertex_means(
@@ -111,14 +149,20 @@ def _without_vertex_means(
     return values - np.stack([mean[vertex] for mean in means], axis=1)
 
 
-def _truncated_solve(normal: np.ndarray, right: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Least-squares change along the eigenvectors that the data determine, and which unknowns lie wholly in
-    them.
+def _told_change(normal: np.ndarray, right: np.ndarray, noise: float) -> tuple[np.ndarray, np.ndarray]:
+    """Least-squares change [3] of the unknowns that the data tell (bool [3]), the others held at 0.
+
+    While some direction of the unknowns has a standard error above LEAST_TOLD, the one that it mostly
+    consists of is held.
     """
-    values, vectors = np.linalg.eigh(normal)
-    kept = values > RCOND * max(values[-1], 1e-12)
-    change = vectors[:, kept] @ ((vectors[:, kept].T @ right) / values[kept])
-    told = (vectors[:, kept] ** 2).sum(axis=1) > 0.9
+    told = np.ones(3, bool)
+    while told.any():
+        values, vectors = np.linalg.eigh(normal[np.ix_(told, told)])
+        if values[0] > max((noise / LEAST_TOLD) ** 2, RCOND * values[-1]):
+            break
+        told[np.flatnonzero(told)[np.abs(vectors[:, 0]).argmax()]] = False
+    change = np.zeros(3)
+    change[told] = np.linalg.solve(normal[np.ix_(told, told)], right[told])
     return change, told
 
 

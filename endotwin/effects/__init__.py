@@ -1,0 +1,110 @@
+"""Effects: what a scene may have beside the paper's light, each simulated only where it is called for.
+
+One module an effect, of the effect's name; ``effect`` says what they share, ``decide`` which of them a
+scene calls for.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import asdict
+from importlib import import_module
+
+from endotwin.effects.effect import STATES, Decision, Effect
+from endotwin.errors import OptionError
+
+FITTED = ("specular", "offset", "shadows", "interreflection", "gain", "vignetting", "profile", "coat")
+RENDERED = ("noise", "motion_blur", "defocus", "rolling_shutter", "chromatic", "bloom", "lens")
+NAMES = (*FITTED, *RENDERED)
+
+__all__ = [
+    "FITTED",
+    "NAMES",
+    "RENDERED",
+    "STATES",
+    "Decision",
+    "Effect",
+    "Effects",
+    "effect_class",
+    "parse_states",
+]
+
+
+class Effects(Mapping[str, Effect]):
+    """The effects that are on, by name, in the order of NAMES."""
+
+    def __init__(self, effects: Iterable[Effect] = ()):
+        by_name = {effect.name: effect for effect in effects}
+        self._effects = {name: by_name[name] for name in NAMES if name in by_name}
+
+    def __getitem__(self, name: str) -> Effect:
+        return self._effects[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._effects)
+
+    def __len__(self) -> int:
+        return len(self._effects)
+
+    def __repr__(self) -> str:
+        return f"Effects({', '.join(self) or 'none'})"
+
+    def including(self, effect: Effect) -> Effects:
+        """These effects with ``effect`` on, in place of one of its name."""
+        return Effects([*(other for name, other in self.items() if name != effect.name), effect])
+
+    def without(self, names: Iterable[str]) -> Effects:
+        """These effects with those ``names`` off."""
+        return Effects(effect for name, effect in self.items() if name not in names)
+
+    @property
+    def guides_mm(self) -> tuple[tuple[float, float, float], ...] | None:
+        """Positions of the light guides in the camera frame; None: the light is at the lens."""
+        return self["offset"].guides_mm if "offset" in self else None
+
+    @property
+    def profile(self) -> str:
+        """Angular shape of the light, one of ``guides.PROFILES``."""
+        return "exponential" if "profile" in self else "cosine"
+
+    def to_dict(self) -> dict[str, dict]:
+        """Parameters by name, as plain values."""
+        return {name: asdict(effect) for name, effect in self.items()}
+
+    @classmethod
+    def from_dict(cls, document: Mapping[str, Mapping]) -> Effects:
+        """What ``to_dict`` gave. Raises TypeError, ValueError or KeyError for anything else."""
+        return cls(effect_class(name)(**_tuples(values)) for name, values in document.items())
+
+
+def effect_class(name: str) -> type[Effect]:
+    """The class of the effect ``name``; raises KeyError for any other name."""
+    if name not in NAMES:
+        raise KeyError(name)
+    module = import_module(f"endotwin.effects.{name}")
+    return getattr(module, name.title().replace("_", ""))
+
+
+def parse_states(text: str) -> dict[str, str]:
+    """``shadows=off,gain=on`` as states by name.
+
+    Raises:
+        OptionError: an unknown effect or state.
+    """
+    states = {}
+    for entry in filter(None, (part.strip() for part in text.split(","))):
+        name, _, state = entry.partition("=")
+        if name not in NAMES or state not in STATES:
+            raise OptionError(
+                f"'{entry}' is no choice of an effect; write NAME=auto, on or off with a NAME of "
+                f"{', '.join(NAMES)}"
+            )
+        states[name] = state
+    return states
+
+
+def _tuples(values):
+    """Lists as tuples, at any depth, as frozen parameters are."""
+    if isinstance(values, Mapping):
+        return {name: _tuples(value) for name, value in values.items()}
+    return tuple(_tuples(value) for value in values) if isinstance(values, list) else values

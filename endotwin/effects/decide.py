@@ -1,0 +1,215 @@
+"""Which of the fitted effects a scene calls for: exact arguments first, then a probe of held-out pixels."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+from endotwin.casting import Caster
+from endotwin.effects import Decision, Effect, Effects
+from endotwin.effects.coat import Coat
+from endotwin.effects.gain import Gain
+from endotwin.effects.interreflection import Interreflection, bounced, cell_mm
+from endotwin.effects.offset import MOST_GUIDES, Offset, Search, shadow_columns
+from endotwin.effects.probe import Hypothesis, Probe, Verdict
+from endotwin.effects.profile import Profile
+from endotwin.effects.shadows import Shadows
+from endotwin.effects.specular import Specular
+from endotwin.effects.vignetting import Vignetting
+from endotwin.fit.samples import Samples
+from endotwin.fit.start import PRIOR
+from endotwin.guides import AT_LENS
+from endotwin.twin import Light, Twin
+
+ORDER = ("offset", "interreflection", "gain", "profile", "vignetting")
+"""Effects that are tried, each beside those already kept; the strongest first."""
+
+
+@dataclass(frozen=True)
+class Decided:
+    """The model of light that a scene calls for.
+
+    Attributes:
+        effects: those that are on, with parameters. decisions: of every fitted effect, by name.
+        light: where the fit starts instead of at the closed form, which is right for a light at the lens
+            alone; None where that is what it is, L0 = 0 where nothing tells its strength. gamma: the
+            response to start with.
+    """
+
+    effects: Effects
+    decisions: dict[str, Decision]
+    light: Light | None
+    gamma: float
+
+
+def decide(samples: Samples, twin: Twin, caster: Caster, wanted: Mapping[str, str]) -> Decided:
+    """Decide the effects of the light from ``samples`` that tell it.
+
+    Args:
+        wanted: auto, on or off by name of the effect; auto unless given.
+    """
+    trial = _Trial(Probe(samples, twin, caster), wanted)
+    for name in ORDER:
+        if trial.wanted(name) == "on":
+            trial.adopt(name, None)
+    while (best := trial.strongest()) is not None:
+        trial.adopt(*best)
+    return trial.decided()
+
+
+class _Trial:
+    """Hypotheses about one probe, from the plainest to what it calls for."""
+
+    def __init__(self, probe: Probe, wanted: Mapping[str, str]):
+        self._probe, self._wanted = probe, wanted
+        self._kept = probe.fit(Hypothesis())
+        self._left = [name for name in ORDER if self.wanted(name) == "auto"]
+        self._seconds = dict.fromkeys((*ORDER, "shadows"), 0.0)
+        self._decisions: dict[str, Decision] = {}
+
+    def wanted(self, name: str) -> str:
+        return self._wanted.get(name, "auto")
+
+    def strongest(self) -> tuple[str, Verdict] | None:
+        """The effect that gains most beside those kept, if any is worth keeping."""
+        tried = {name: self._tried(name) for name in self._left if self._possible(name)}
+        self._tried_last = tried
+        name = max(tried, key=lambda name: tried[name].gain_db, default=None)
+        return (name, tried[name]) if name is not None and tried[name].keep else None
+
+    def adopt(self, name: str, verdict: Verdict | None) -> None:
+        """Keep the effect; of an offset, only if what is found of it predicts better too."""
+        began = time.perf_counter()
+        if name in self._left:
+            self._left.remove(name)
+        if name == "offset":
+            self._adopt_offset(forced=verdict is None)
+        else:
+            found = self._probe.fit(self._hypothesis(name))
+            verdict = verdict or self._probe.compare(self._kept, found)
+            self._kept = found
+            self._decide(name, "on", _reason(verdict, self.wanted(name)), verdict)
+        self._seconds[name] += time.perf_counter() - began
+
+    def decided(self) -> Decided:
+        """What was kept, and why not the rest."""
+        for name in ORDER:
+            if name not in self._decisions:
+                self._decide(name, "off", self._why_not(name), self._tried_last.get(name))
+        if "shadows" not in self._decisions:
+            reason = "light at the lens casts no shadow that the lens sees"
+            self._decide("shadows", "off", reason, None)
+        self._decide_surface()
+        decisions = {
+            name: replace(decision, fit_s=round(self._seconds.get(name, 0.0), 3))
+            for name, decision in self._decisions.items()
+        }
+        effects, kept = self._effects(), self._kept
+        plain = not set(effects) - {"specular"}
+        if "interreflection" in effects:
+            return Decided(
+                effects, decisions, Light(kept.hypothesis.bounced.L0, PRIOR["n"], PRIOR["q"]), PRIOR["gamma"]
+            )
+        return Decided(effects, decisions, None if plain else Light(0.0, kept.n, kept.q), kept.gamma)
+
+    def _possible(self, name: str) -> bool:
+        """Exact arguments: what no photo of this scene could tell."""
+        if len(self._probe) == 0:
+            return False
+        if name == "vignetting":
+            return self._kept.hypothesis.guides_mm != AT_LENS
+        return name != "gain" or len(self._probe.frames) > 1
+
+    def _why_not(self, name: str) -> str:
+        if self.wanted(name) == "off":
+            return "forced off"
+        if not self._possible(name):
+            return {
+                "vignetting": "with the light at the lens its profile says the same of every pixel",
+                "gain": "a single frame has no other to be brighter than",
+            }.get(name, "the photos show too little")
+        return f"does not predict held-out pixels better ({self._tried_last[name]})"
+
+    def _tried(self, name: str) -> Verdict:
+        began = time.perf_counter()
+        if name == "offset":
+            other = self._probe.with_columns(self._kept, shadow_columns(self._probe))
+        else:
+            other = self._probe.fit(self._hypothesis(name))
+        verdict = self._probe.compare(self._kept, other)
+        self._seconds[name] += time.perf_counter() - began
+        return verdict
+
+    def _hypothesis(self, name: str) -> Hypothesis:
+        kept = self._kept.hypothesis
+        if name == "interreflection":
+            return replace(kept, bounced=bounced(self._probe, kept))
+        if name == "profile":
+            return replace(kept, profile="exponential")
+        return replace(kept, **{name: True})
+
+    def _adopt_offset(self, forced: bool) -> None:
+        base, search = self._kept, Search(self._probe, self._kept)
+        best = None
+        for number in range(1, MOST_GUIDES + 1):
+            found = self._probe.fit(search.best(number, best))
+            if (best is None and forced and number == 2) or self._probe.compare(best or base, found).keep:
+                best = found
+            elif number > 1:
+                break
+        if best is None:
+            self._decide("offset", "off", "no position of one to three guides predicts better", None)
+            return
+        verdict = self._probe.compare(base, best)
+        unshadowed = self._probe.fit(replace(best.hypothesis, shadows=False))
+        shadow = self._probe.compare(unshadowed, best)
+        shadows = self.wanted("shadows") == "on" or (self.wanted("shadows") == "auto" and shadow.keep)
+        self._kept = best if shadows else unshadowed
+        self._decide("offset", "on", _reason(verdict, self.wanted("offset")), verdict)
+        reason = (
+            _reason(shadow, self.wanted("shadows")) if shadows else "no shadow that a held-out pixel shows"
+        )
+        self._decide("shadows", "on" if shadows else "off", reason, shadow)
+
+    def _decide_surface(self) -> None:
+        """What no probe of diffuse pixels could tell: the lobe is the published material's, a coat an
+        addition."""
+        on = self.wanted("specular") != "off"
+        reason = "part of the published material; its strength f0 is fitted" if on else "forced off"
+        self._decide("specular", "on" if on else "off", reason, None)
+        coat = self.wanted("coat") == "on"
+        reason = (
+            "forced on" if coat else "a film over tissue shows only where it is asked for: --effects coat=on"
+        )
+        self._decide("coat", "on" if coat else "off", reason, None)
+
+    def _decide(self, name: str, state: str, reason: str, verdict: Verdict | None) -> None:
+        gain_db = None if verdict is None else round(verdict.gain_db, 3)
+        self._decisions[name] = Decision(state, reason, gain_db)
+
+    def _effects(self) -> Effects:
+        kept, probe = self._kept, self._probe
+        effects: list[Effect] = [Specular()] if self.wanted("specular") != "off" else []
+        if kept.hypothesis.guides_mm != AT_LENS:
+            effects.append(Offset(kept.hypothesis.guides_mm))
+        if kept.hypothesis.shadows:
+            effects.append(Shadows())
+        if kept.hypothesis.bounced is not None:
+            effects.append(Interreflection(cell_mm(probe.samples.log_distance.numpy())))
+        if kept.hypothesis.profile != "cosine":
+            effects.append(Profile())
+        if kept.hypothesis.gain:
+            log_gain = kept.log_gain - kept.log_gain.mean()
+            effects.append(Gain(tuple(map(int, probe.frames)), tuple(map(float, log_gain))))
+        if kept.hypothesis.vignetting:
+            k2, k4 = kept.effects.coefficients[3:] / kept.gamma
+            effects.append(Vignetting(float(k2), float(k4)))
+        if self.wanted("coat") == "on":
+            effects.append(Coat())
+        return Effects(effects)
+
+
+def _reason(verdict: Verdict, wanted: str) -> str:
+    forced = "forced on; " if wanted == "on" else ""
+    return f"{forced}predicts held-out pixels better by {verdict}"

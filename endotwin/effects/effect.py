@@ -1,0 +1,71 @@
+"""What every effect is: named parameters with bounds and units, and how it changes the picture.
+
+An effect is a frozen dataclass whose fields are its parameters, in a module of its name. There are five
+kinds, by where light meets them on its way:
+
+- ``light``: where the light comes from and how it falls (offset, profile, shadows, interreflection);
+- ``surface``: how tissue answers it (specular, coat);
+- ``exposure``: when pixels see it (motion blur, rolling shutter);
+- ``optics``: what the lens makes of the radiance image (vignetting, defocus, chromatic, bloom, lens);
+- ``sensor``: what the sensor makes of that (gain, noise).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from dataclasses import fields as dataclass_fields
+from typing import ClassVar
+
+KINDS = ("light", "surface", "exposure", "optics", "sensor")
+STATES = ("auto", "on", "off")
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """A parameter as a user sees it: bounds that it may take, and its unit ("1" if it has none)."""
+
+    name: str
+    low: float
+    high: float
+    unit: str
+
+
+def parameter(default: float, low: float, high: float, unit: str) -> float:
+    """A dataclass field that is a scalar parameter."""
+    return field(default=default, metadata={"low": low, "high": high, "unit": unit})
+
+
+@dataclass(frozen=True)
+class Effect:
+    """Base of all effects."""
+
+    name: ClassVar[str]
+    kind: ClassVar[str]
+
+    @classmethod
+    def parameters(cls) -> tuple[Parameter, ...]:
+        """The scalar parameters, in the order of the fields."""
+        return tuple(
+            Parameter(f.name, f.metadata["low"], f.metadata["high"], f.metadata["unit"])
+            for f in dataclass_fields(cls)
+            if "unit" in f.metadata
+        )
+
+
+@dataclass(frozen=True)
+class Decision:
+    """Why an effect is on or off, and what that costs.
+
+    Attributes:
+        state: ``on`` or ``off``. reason: one sentence with the evidence.
+        gain_db: held-out gain of the probe; None where none was needed.
+        fit_s: seconds that deciding and fitting it took. render_ms: milliseconds it adds to a frame.
+        memory_mb: memory it holds.
+    """
+
+    state: str
+    reason: str
+    gain_db: float | None = None
+    fit_s: float = 0.0
+    render_ms: float = 0.0
+    memory_mb: float = 0.0

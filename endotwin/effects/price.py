@@ -1,0 +1,61 @@
+"""What each effect of a twin costs: milliseconds a frame, megabytes."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from endotwin.effects import RENDERED, Decision, effect_class
+from endotwin.render import Renderer
+
+if TYPE_CHECKING:
+    from endotwin.casting import Caster
+    from endotwin.twin import Twin
+
+REPEATS = 2
+
+
+def priced(twin: Twin, caster: Caster) -> Twin:
+    """``twin`` with the price of each effect that is on in its decisions, and those only rendered in them
+    too."""
+    decisions = {**twin.decisions, **_rendered(twin)}
+    dear = [name for name in twin.effects if name in decisions and name != "specular"]
+    if dear:
+        whole_ms = _frame_ms(twin, caster)
+        for name in dear:
+            gone = {"offset": ("offset", "shadows")}.get(name, (name,))
+            other_ms = _frame_ms(replace(twin, effects=twin.effects.without(gone)), caster)
+            decisions[name] = replace(
+                decisions[name],
+                render_ms=round(max(0.0, whole_ms - other_ms), 1),
+                memory_mb=round(_memory_mb(twin, name, caster), 1),
+            )
+    return replace(twin, decisions=decisions)
+
+
+def _frame_ms(twin: Twin, caster: Caster) -> float:
+    """Best of a few renderings of the sequence's middle frame."""
+    renderer, poses = Renderer(twin, caster=caster), twin.source.open().T_world_camera
+    best = float("inf")
+    for _ in range(REPEATS):
+        began = time.perf_counter()
+        renderer.view(poses[len(poses) // 2])
+        best = min(best, 1e3 * (time.perf_counter() - began))
+    return best
+
+
+def _memory_mb(twin: Twin, name: str, caster: Caster) -> float:
+    from endotwin.illumination import Illumination
+
+    return Illumination(twin, caster).nbytes / 1e6 if name == "interreflection" else 0.0
+
+
+def _rendered(twin: Twin) -> dict[str, Decision]:
+    """Decisions of the effects that no fit needs: the lens is seen at once, the others are rendered on
+    request."""
+    lens, reason = effect_class("lens").evidence(twin.source.open())
+    decisions = {
+        name: Decision("off", f"rendered on request: synth --effects {name}=on") for name in RENDERED
+    }
+    return {**decisions, "lens": Decision("off" if lens is None else "on", reason)}

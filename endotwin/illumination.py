@@ -1,0 +1,152 @@
+"""What lights a twin's surface in one view: the light at the lens or guides beside it, shadows, bounced
+light."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from endotwin import shading
+from endotwin.casting import Caster, Correspondences
+from endotwin.effects.coat import F0_WATER
+from endotwin.guides import AT_LENS, Guided, guided, log_axis, visible_from
+from endotwin.incidence import incidence_on
+from endotwin.radiosity import Radiosity
+from endotwin.twin import Twin
+
+
+class Illumination:
+    """The light of one twin; makes only what the twin's effects ask for."""
+
+    def __init__(self, twin: Twin, caster: Caster):
+        self.twin = twin
+        self._caster = caster
+        self._radiosity = self._albedo = None
+        if "interreflection" in twin.effects:
+            surface, base_color = twin.surface, twin.materials.base_color
+            self._radiosity = Radiosity(surface, caster, twin.effects["interreflection"].cell_mm)
+            per_vertex = shading.specular_albedo(
+                torch.from_numpy(twin.materials.roughness), twin.materials.f0
+            )
+            answer = base_color + per_vertex.numpy()[:, None]
+            self._albedo = self._radiosity.mean(answer[surface.triangles].mean(axis=1))
+
+    @property
+    def nbytes(self) -> int:
+        """Memory of what is kept between views, bytes."""
+        return 0 if self._radiosity is None else self._radiosity.nbytes
+
+    def at(self, T_world_camera: np.ndarray) -> ViewLight:
+        """The light of the view from ``T_world_camera`` [4, 4]."""
+        T_local_camera = self.twin.surface.to_local(T_world_camera)
+        irradiance = None if self._radiosity is None else self._bounced(T_local_camera)
+        return ViewLight(self.twin, self._caster, T_local_camera, irradiance)
+
+    def _bounced(self, T_local_camera: np.ndarray) -> np.ndarray:
+        """Indirect irradiance of the vertices, float32 [V, 3], with L0 = 1."""
+        light, effects, radiosity = self.twin.light, self.twin.effects, self._radiosity
+        lamps = [
+            radiosity.lamp(T_local_camera, np.asarray(guide), effects.profile)
+            for guide in effects.guides_mm or AT_LENS
+        ]
+        direct = radiosity.direct(lamps, light.n, light.q).mean(axis=1, keepdims=True)
+        return radiosity.to_vertex @ radiosity.indirect(direct, self._albedo)[:, 0]
+
+
+@dataclass(frozen=True)
+class ViewLight:
+    """The light of one view.
+
+    Attributes:
+        T_local_camera: the pose in the surface's frame, float64 [4, 4].
+        irradiance: what other tissue throws on each vertex, float32 [V, 3], with L0 = 1; None: nothing.
+    """
+
+    twin: Twin
+    caster: Caster
+    T_local_camera: np.ndarray
+    irradiance: np.ndarray | None
+
+    def radiance(
+        self, hits: Correspondences, directions: np.ndarray, normals: np.ndarray, material: Tensor
+    ) -> tuple[Tensor, np.ndarray | None]:
+        """Radiance of hits.
+
+        Args:
+            directions: unit viewing rays of all pixels, float32 [..., 3]. normals: float32 [N, 3]; both in
+                the camera frame. material: base colour, roughness and metallic of the hits, [N, 5].
+
+        Returns:
+            float32 [N, 3]; and which guides each point sees, float32 [N, K] (None where no shadow is cast).
+        """
+        diffuse = shading.diffuse(material[:, :3], material[:, 4])
+        visible = None
+        if self.twin.effects.guides_mm is None:
+            x = self._at_lens(hits, directions, normals, diffuse, material[:, 3])
+        else:
+            view = directions.reshape(-1, 3).take(hits.pixel, axis=0)
+            points_mm = view * hits.distance_mm[:, None]
+            guides_mm = np.asarray(self.twin.effects.guides_mm, np.float32)
+            if "shadows" in self.twin.effects:
+                visible = visible_from(self.caster, self.T_local_camera, points_mm, guides_mm)
+            lit = guided(points_mm, normals, guides_mm, self.twin.effects.profile, visible)
+            cos_o = torch.from_numpy(np.clip(-(normals * view).sum(axis=1), 1e-4, 1))
+            x = self._beside_lens(lit, cos_o, diffuse, material[:, 3])
+        if self.irradiance is not None:
+            bounced = torch.from_numpy(hits.interpolate(self.twin.surface, self.irradiance))
+            view = directions.reshape(-1, 3).take(hits.pixel, axis=0)
+            cos_o = torch.from_numpy(np.clip(-(normals * view).sum(axis=1), 1e-4, 1))
+            glossy = shading.specular_of_even_light(cos_o, material[:, 3], self.twin.materials.f0)[:, None]
+            x = x + bounced * (diffuse + glossy / math.pi) * (2 * math.pi * self.twin.light.L0)
+        return x, visible
+
+    def _at_lens(
+        self,
+        hits: Correspondences,
+        directions: np.ndarray,
+        normals: np.ndarray,
+        diffuse: Tensor,
+        roughness: Tensor,
+    ) -> Tensor:
+        geometry = incidence_on(normals, hits, directions)
+        cos, sin2, cone, distance = (torch.from_numpy(value) for value in vars(geometry).values())
+        if self.twin.effects.profile != "cosine":
+            cone = torch.from_numpy(log_axis(np.exp(geometry.log_cos_axis), self.twin.effects.profile))
+        strength = self._strength(cone, distance) * cos
+        if self.twin.materials.diffuse == "burley":
+            diffuse = diffuse * shading.burley(cos, cos, torch.ones_like(cos), roughness)[:, None]
+        for f0, rough in self._lobes(roughness):
+            diffuse = diffuse + f0 * shading.specular_colocated(cos, sin2, rough)[:, None]
+        return diffuse * strength[:, None]
+
+    def _beside_lens(self, lit: Guided, cos_o: Tensor, diffuse: Tensor, roughness: Tensor) -> Tensor:
+        count = lit.cos_i.shape[1]
+        x = torch.zeros_like(diffuse)
+        for k in range(count):
+            cos_i = lit.cos_i[:, k]
+            answer = diffuse
+            if self.twin.materials.diffuse == "burley":
+                answer = answer * shading.burley(cos_i, cos_o, lit.cos_d[:, k], roughness)[:, None]
+            for f0, rough in self._lobes(roughness):
+                answer = answer + f0 * shading.specular_lobe(cos_i, cos_o, lit.sin2_m[:, k], rough)[:, None]
+            strength = self._strength(lit.log_axis[:, k], lit.log_distance[:, k])
+            x += answer * (strength * cos_i / count)[:, None]
+        return x
+
+    def _strength(self, cone: Tensor, distance: Tensor) -> Tensor:
+        """2π·L of the points, [N]."""
+        light = self.twin.light
+        log_L0 = math.log(max(light.L0, 1e-30))
+        return torch.exp(shading.log_spotlight(log_L0, light.n, light.q, cone, distance)) * (2 * math.pi)
+
+    def _lobes(self, roughness: Tensor) -> list[tuple[float, Tensor]]:
+        """f0 and roughness [N] of each specular lobe."""
+        lobes = [(self.twin.materials.f0, roughness)] if self.twin.materials.f0 > 0 else []
+        if "coat" in self.twin.effects:
+            coat = self.twin.effects["coat"]
+            lobes.append((coat.weight * F0_WATER, torch.full_like(roughness, coat.roughness)))
+        return lobes

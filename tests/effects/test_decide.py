@@ -1,0 +1,90 @@
+"""Which effects are called for, on sequences that an independent path tracer made."""
+
+import os
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from endotwin.casting import Caster
+from endotwin.config import STANDARD
+from endotwin.effects.decide import decide
+from endotwin.fit.pace import Pace
+from endotwin.fit.samples import gather
+from endotwin.pipeline import fuse_twin
+
+EXAMPLE = Path(__file__).parents[2] / "examples" / "colon_small"
+DATA = Path(os.environ.get("ENDOTWIN_DATA", "nowhere"))
+needs_data = pytest.mark.skipif(not DATA.is_dir(), reason="ENDOTWIN_DATA names no folder")
+LIGHT = ("offset", "shadows", "interreflection", "gain", "vignetting", "profile")
+
+
+def scene(path: Path, scale: float):
+    """A fused twin of the sequence, a caster of its mesh, and the pixels that a fit would look at."""
+    twin = fuse_twin(path, scale=scale)
+    caster = Caster(twin.surface)
+    samples = gather(twin, Pace(STANDARD.fit), 0, caster)
+    smooth = twin.surface.normal_agreement() > np.cos(np.radians(5))
+    telling = smooth[samples.triangle.numpy()] & (samples.color.numpy().max(axis=1) < 250)
+    return twin, caster, samples[torch.from_numpy(np.flatnonzero(telling))]
+
+
+@pytest.fixture(scope="module")
+def example():
+    return scene(EXAMPLE, 1.0)
+
+
+def states(decided) -> dict[str, str]:
+    return {name: decided.decisions[name].state for name in LIGHT}
+
+
+def brightened(samples, log_gain: np.ndarray):
+    """The samples as a camera of gamma 2.2 would have shown them with a gain of each frame."""
+    frame = samples.frame.numpy()
+    factor = np.exp(log_gain[frame] / 2.2)[:, None]
+    color = np.clip(samples.color.numpy() * factor, 0, 255)
+    return replace(samples, color=torch.from_numpy(np.uint8(color + 0.5)))
+
+
+def test_a_scene_lit_as_in_the_paper_calls_for_no_effect(example):
+    twin, caster, samples = example
+    assert set(states(decide(samples, twin, caster, {})).values()) == {"off"}
+
+
+def test_gain_is_found_to_a_hundredth(example):
+    twin, caster, samples = example
+    log_gain = np.random.default_rng(3).normal(0, 0.15, 64)
+    decided = decide(brightened(samples, log_gain), twin, caster, {})
+    assert states(decided) == {**dict.fromkeys(LIGHT, "off"), "gain": "on"}
+    gain = decided.effects["gain"]
+    true = log_gain[list(gain.frames)]
+    assert np.abs(np.array(gain.log_gain) - (true - true.mean())).max() < 0.02
+
+
+def test_an_effect_that_is_forced_off_stays_off(example):
+    twin, caster, samples = example
+    log_gain = np.random.default_rng(3).normal(0, 0.15, 64)
+    decided = decide(brightened(samples, log_gain), twin, caster, {"gain": "off"})
+    assert decided.decisions["gain"].state == "off"
+    assert decided.decisions["gain"].reason == "forced off"
+
+
+@needs_data
+def test_interreflection_turns_itself_on_in_a_tube_that_has_it():
+    decided = decide(*reordered(scene(DATA / "colon_gi", 0.5)), {})
+    assert states(decided) == {**dict.fromkeys(LIGHT, "off"), "interreflection": "on"}
+
+
+@needs_data
+def test_guides_are_found_within_half_a_millimetre_with_their_shadows():
+    decided = decide(*reordered(scene(DATA / "colon_offset", 0.5)), {})
+    assert states(decided) == {**dict.fromkeys(LIGHT, "off"), "offset": "on", "shadows": "on"}
+    guides_mm = np.array(sorted(decided.effects["offset"].guides_mm))
+    np.testing.assert_allclose(guides_mm, [[-2.5, 1.0, 0.0], [2.5, 0.0, 0.0]], atol=0.5)
+
+
+def reordered(made):
+    twin, caster, samples = made
+    return samples, twin, caster
