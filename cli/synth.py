@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 from endotwin.cli import console
 
+from endotwin.effects import parse_states
 from endotwin.errors import OptionError
 from endotwin.output import DATASET, check_apart, check_free, check_picture
 
@@ -61,6 +62,14 @@ def synth(
         Path | None,
         typer.Option(metavar="FILE.yaml", help="Draw edits from the ranges in this file, frame by frame."),
     ] = None,
+    effects: Annotated[
+        str,
+        typer.Option(
+            metavar="NAME=STATE,…",
+            help="Effects on or off, as in noise=on,shadows=off; as the twin has them unless named.",
+            show_default=False,
+        ),
+    ] = "",
     clearance: Annotated[
         float, typer.Option(metavar="MM", help="Least distance of a pose from the wall.")
     ] = 1.0,
@@ -116,7 +125,7 @@ def synth(
             twin = Twin.load(twin_folder)
         limits = Limits(clearance, max_unseen, float("inf") if max_distance is None else max_distance)
         choices = {"material": material or (), "light": light or (), "vary": vary, "camera": camera}
-        choices |= {"limits": limits, "seed": seed, "overwrite": overwrite}
+        choices |= {"effects": parse_states(effects), "limits": limits, "seed": seed, "overwrite": overwrite}
         with run.stage("synth"):
             if preview:
                 summary = pipeline.preview(twin, trajectory, preview, **choices)

@@ -129,6 +129,7 @@ def synthesize(
     light: Iterable[str] = (),
     vary: Path | str | None = None,
     camera: Path | str | None = None,
+    effects: Mapping[str, str] | None = None,
     labels: str | None = None,
     layout: str = "c3vd",
     limits: Limits | None = None,
@@ -147,6 +148,7 @@ def synthesize(
         material: edits such as ``roughness*1.3``. light: edits such as ``intensity*0.8``.
         vary: YAML file of ranges that edits are drawn from (see ``endotwin.synth.read_variation``).
         camera: a ``camera.json`` to render through; the twin's own camera unless given.
+        effects: on or off by name; noise and lens get the strength that is measured in the twin's sequence.
         labels: names such as ``rgb,depth`` (see ``endotwin.synth.LABELS``), or ``all``.
         layout: one of ``endotwin.synth.LAYOUTS``.
         limits: what a pose must keep to be rendered.
@@ -163,7 +165,7 @@ def synthesize(
     """
     from endotwin.synth import render_dataset
 
-    job = _job(twin, trajectory, material, light, vary, camera, labels, layout, limits, seed)
+    job = _job(twin, trajectory, material, light, vary, camera, effects, labels, layout, limits, seed)
     return render_dataset(job, out, workers, scheduler, overwrite, progress)
 
 
@@ -176,6 +178,7 @@ def preview(
     light: Iterable[str] = (),
     vary: Path | str | None = None,
     camera: Path | str | None = None,
+    effects: Mapping[str, str] | None = None,
     limits: Limits | None = None,
     seed: int = 0,
     overwrite: bool = False,
@@ -187,7 +190,7 @@ def preview(
     """
     from endotwin.synth import preview as draw
 
-    job = _job(twin, trajectory, material, light, vary, camera, "rgb", "c3vd", limits, seed)
+    job = _job(twin, trajectory, material, light, vary, camera, effects, "rgb", "c3vd", limits, seed)
     return draw.preview(job, out, overwrite)
 
 
@@ -198,6 +201,7 @@ def _job(
     light: Iterable[str],
     vary: Path | str | None,
     camera: Path | str | None,
+    effects: Mapping[str, str] | None,
     labels: str | None,
     layout: str,
     limits: Limits | None,
@@ -206,6 +210,7 @@ def _job(
     from endotwin import synth
 
     lens = read_camera(Path(camera)) if camera else twin.camera
+    twin = synth.equipped(twin, effects or {}, trajectory)
     edits = [synth.parse_material_edit(edit) for edit in material]
     variation = synth.fixed(edits, [synth.parse_light_edit(edit) for edit in light])
     if vary:

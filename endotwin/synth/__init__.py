@@ -6,6 +6,7 @@ from endotwin.synth.job import Job
 from endotwin.synth.labels import DEFAULT_LABELS, LABELS, parse_labels
 from endotwin.synth.layouts import LAYOUTS
 from endotwin.synth.screening import Limits
+from endotwin.synth.switches import equipped
 from endotwin.synth.trajectories import Trajectory, parse_trajectory
 from endotwin.synth.variation import Variation, fixed, read_variation
 
@@ -19,6 +20,7 @@ __all__ = [
     "Summary",
     "Trajectory",
     "Variation",
+    "equipped",
     "fixed",
     "make_job",
     "parse_labels",

@@ -10,10 +10,12 @@ import numpy as np
 from endotwin.casting import Caster, Correspondences
 from endotwin.errors import OptionError
 from endotwin.incidence import to_camera
+from endotwin.effects.exposure import following
 from endotwin.render import Renderer, View, laid_out
 from endotwin.surface import Surface
 from endotwin.synth.flow import flow_to, hides_surface, seen_from, surface_points
 from endotwin.synth.job import Job
+from endotwin.synth.photograph import photographed
 
 MASK_NONE, MASK_FILLED, MASK_UNSEEN, MASK_VALID = 0, 64, 128, 255
 HIDDEN_NONE, HIDDEN_NO, HIDDEN_YES = 128, 0, 255
@@ -36,6 +38,9 @@ LABELS: dict[str, tuple[str, ...]] = {
 """Labels that may be asked for, and the images that each one is written as."""
 
 DEFAULT_LABELS = ("rgb", "depth", "normals", "mask")
+
+SENSOR = 2
+"""Stream of the random numbers of each frame's sensor."""
 
 
 def parse_labels(text: str) -> tuple[str, ...]:
@@ -67,6 +72,7 @@ class Labeller:
         self._job = job
         self._caster = Caster(job.twin.surface, threads=1)
         self._kinds = triangle_kinds(job.twin.surface)
+        self._T_world_next = following(job.trajectory.T_world_camera)
         self._shaded: tuple[object, Renderer, Renderer | None] | None = None
 
     def frame(self, index: int) -> dict[str, np.ndarray]:
@@ -79,7 +85,11 @@ class Labeller:
             renderer, specular_free = self._renderers(index)
         if {"rgb", "rgb_linear"} & set(job.labels):
             view = renderer.view(T_world_camera)
-            images = {"rgb": view.color, "rgb_linear": view.radiance}
+            generator = np.random.default_rng([job.document["seed"], SENSOR, index])
+            color, radiance = photographed(
+                renderer, view, T_world_camera, self._T_world_next[index], generator
+            )
+            images = {"rgb": color, "rgb_linear": radiance}
         if specular_free is not None:
             matt = specular_free.view(T_world_camera)
             images["diffuse"], view = matt.color, view or matt

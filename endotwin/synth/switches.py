@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import fields, replace
 
 import numpy as np
 
-from endotwin.effects import NAMES, Effects, effect_class
+from endotwin.effects import FITTED, NAMES, RENDERED, Effects, effect_class
 from endotwin.effects.offset import Offset
 from endotwin.errors import OptionError
 from endotwin.synth.edits import OFFSETS, Edit
+from endotwin.twin import Twin
 
 AT_LENS = ((0.0, 0.0, 0.0),)
+NEED_VELOCITY = ("motion_blur", "rolling_shutter")
 
 
 def parameter_names() -> tuple[str, ...]:
@@ -28,6 +30,25 @@ def switched(effects: Effects, switches: Iterable[tuple[str, bool]]) -> Effects:
         elif name not in effects:
             effects = effects.including(effect_class(name)())
     return effects
+
+
+def equipped(twin: Twin, states: Mapping[str, str], trajectory: str) -> Twin:
+    """The twin with effects on or off as ``states`` say; strengths are measured in its sequence where they can be.
+
+    Raises:
+        OptionError: an effect that only a fit can turn on, or blur of a trajectory without a velocity.
+    """
+    effects = twin.effects.without([name for name, state in states.items() if state == "off"])
+    for name, state in states.items():
+        if state != "on" or name in effects:
+            continue
+        if name in FITTED and name != "coat":
+            raise OptionError(f"the twin has no {name}; 'endotwin fit' with --effects {name}=on finds it")
+        if name in NEED_VELOCITY and trajectory.startswith("jitter"):
+            raise OptionError(f"{name} needs poses that follow each other, and those of jitter do not")
+        found = effect_class(name).evidence(twin.sequence())[0] if name in RENDERED else None
+        effects = effects.including(found or effect_class(name)())
+    return replace(twin, effects=effects)
 
 
 def require_switchable(name: str, effects: Effects) -> None:

@@ -1,0 +1,45 @@
+"""From a rendered view to the photo that a camera would have taken of it: exposure, optics, sensor."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from endotwin import shading
+from endotwin.effects import RENDERED
+from endotwin.effects.exposure import Shot, expose
+from endotwin.render import Renderer, View
+
+EXPOSURE = ("motion_blur", "rolling_shutter")
+OPTICS = ("defocus", "chromatic", "bloom", "lens")
+"""In the order in which light meets them."""
+
+
+def photographed(
+    renderer: Renderer,
+    view: View,
+    T_world_camera: np.ndarray,
+    T_world_next: np.ndarray,
+    generator: np.random.Generator,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Display values and linear radiance float32 [H, W, 3] of ``view`` with the twin's rendered effects.
+
+    Args:
+        T_world_camera: the view's pose [4, 4]. T_world_next: that of one frame interval later: the velocity.
+        generator: of the noise.
+    """
+    effects, camera = renderer.twin.effects, renderer.camera
+    if not set(effects) & set(RENDERED):
+        return view.color, view.radiance
+    radiance = torch.from_numpy(view.radiance)
+    timed = [effects[name] for name in EXPOSURE if name in effects]
+    if timed:
+        shot = Shot(camera, T_world_camera, T_world_next, view.depth_mm)
+        radiance = expose(lambda T, mask: torch.from_numpy(renderer.view(T, mask).radiance), shot, timed)
+    for name in OPTICS:
+        if name in effects:
+            radiance = effects[name].through(radiance, view.depth_mm, camera)
+    color = shading.respond(radiance, renderer.twin.response.gamma).clamp(0, 1).numpy()
+    if "noise" in effects:
+        color = effects["noise"].read(color, generator)
+    return color, radiance.numpy()
