@@ -49,7 +49,7 @@ def fit(
         str,
         typer.Option(
             metavar="NAME=STATE,…",
-            help="auto, on or off by name, as in shadows=off,gain=on; auto unless named here or in the config.",
+            help="auto, on or off by name, as in shadows=off,gain=on; auto unless named.",
             show_default=False,
         ),
     ] = "",

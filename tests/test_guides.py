@@ -16,7 +16,7 @@ RADIUS_MM, CENTRE_MM, WALL_MM = 2.0, 10.0, 20.0
 def points() -> tuple[np.ndarray, np.ndarray]:
     """Points before the camera [N, 3], and unit normals that face it."""
     generator = np.random.default_rng(0)
-    points_mm = generator.normal(0, 4, (500, 3)) + [0, 0, 20]
+    points_mm = generator.normal((0, 0, 20), 4, (500, 3))
     normals = unit(-points_mm + generator.normal(0, 4, (500, 3)))
     facing = dot(normals, -points_mm) > 0
     return points_mm[facing].astype(np.float32), normals[facing].astype(np.float32)
@@ -52,7 +52,7 @@ def test_a_guide_behind_the_surface_gives_no_light(points):
 
 
 def test_a_ball_before_a_wall_throws_its_analytic_shadow():
-    """The shadow of a ball is the cone of its tangents (Euclid): sin of the half angle = radius / distance."""
+    """The shadow of a ball is the cone of its tangents: sin of the half angle = radius / distance."""
     ball = trimesh.creation.icosphere(subdivisions=5, radius=RADIUS_MM).apply_translation([0, 0, CENTRE_MM])
     wall = trimesh.Trimesh([[-30, -30, WALL_MM], [30, -30, WALL_MM], [0, 40, WALL_MM]], [[0, 1, 2]])
     both = trimesh.util.concatenate([ball, wall])

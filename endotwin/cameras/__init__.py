@@ -30,9 +30,8 @@ VIEW_GRID = 24
 """A camera is judged by so many pixels a side."""
 
 LEAST_SEEING = 0.1
-WIDE_VIEW_DEG = 175.0
-VIEW_DEG = (0.1, 80.0)
-"""The median pixel of a camera that is of use looks so far from its axis; one that no pinhole is may see wider."""
+VIEW_DEG, WIDE_VIEW_DEG = (0.1, 80.0), 175.0
+"""The median pixel of a useful pinhole looks so far from its axis, that of a fisheye at most the latter."""
 
 LARGEST = 1e9
 """Magnitude beyond which no parameter of a camera in pixels makes sense."""

@@ -8,9 +8,9 @@ from functools import cached_property
 import numpy as np
 
 from endotwin.casting import Caster, Correspondences
+from endotwin.effects.exposure import following
 from endotwin.errors import OptionError
 from endotwin.incidence import to_camera
-from endotwin.effects.exposure import following
 from endotwin.render import Renderer, View, laid_out
 from endotwin.surface import Surface
 from endotwin.synth.flow import flow_to, hides_surface, seen_from, surface_points

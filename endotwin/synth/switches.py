@@ -33,7 +33,7 @@ def switched(effects: Effects, switches: Iterable[tuple[str, bool]]) -> Effects:
 
 
 def equipped(twin: Twin, states: Mapping[str, str], trajectory: str) -> Twin:
-    """The twin with effects on or off as ``states`` say; strengths are measured in its sequence where they can be.
+    """The twin with effects on or off as ``states`` say, as strong as its sequence shows them to be.
 
     Raises:
         OptionError: an effect that only a fit can turn on, or blur of a trajectory without a velocity.
