@@ -134,7 +134,6 @@ class GaussNewton:
         held: tuple[str, ...] = (),
         seed: int = 0,
         out_of_time: Callable[[], bool] = lambda: False,
-        cg_steps: int = CG_STEPS,
     ):
         vertex_count = operator.forward_csr.shape[0]
         self.triangles = torch.from_numpy(triangles.astype(np.int64))
@@ -144,7 +143,6 @@ class GaussNewton:
         self._unit_mm = unit_mm
         self.held = held
         self.out_of_time = out_of_time
-        self.cg_steps = cg_steps
         self._trial_rows = _drawn(len(samples), SEARCH_SAMPLES, seed)
         self.relight(samples)
         self.squared_adjoint = _squared(operator.adjoint_csr)
@@ -219,7 +217,7 @@ class GaussNewton:
         block = equations.lumped() * (link * link.transpose(1, 2)) * scale
         block = (self.squared_adjoint @ block.reshape(len(link), -1)).reshape(-1, CHANNELS, CHANNELS)
         inverse = torch.linalg.inv(block + torch.diag_embed(self.precision))
-        solved = conjugate_gradients(product, right, inverse, self.out_of_time, self.cg_steps)
+        solved = conjugate_gradients(product, right, inverse, self.out_of_time)
 
         if not joint:
             return solved[..., 0], torch.zeros_like(spread)
@@ -281,7 +279,6 @@ def conjugate_gradients(
     right: Tensor,
     inverse: Tensor,
     out_of_time: Callable[[], bool] = lambda: False,
-    steps: int = CG_STEPS,
 ) -> Tensor:
     """Solve for all right-hand sides [R, C, K] at once, preconditioned by blocks ``inverse`` [R, C, C].
 
@@ -293,7 +290,7 @@ def conjugate_gradients(
     direction = z.clone()
     energy = (residual * z).sum(dim=(0, 1))
     goal = CG_TOLERANCE**2 * energy
-    for _ in range(steps):
+    for _ in range(CG_STEPS):
         image = product(direction)
         length = energy / (direction * image).sum(dim=(0, 1)).clamp_min(1e-30)
         x += length * direction

@@ -40,9 +40,6 @@ LIGHT_COARSEST_MM = 12.0
 """Cells of the features beside which light and response are found, in units of the scene."""
 
 LIGHT_PIXELS, LIGHT_STEPS = 400_000, 4
-LIGHT_CG_STEPS = 80
-"""Solved less exactly, the joint steps stop at values of γ that differ by 4 % from seed to seed."""
-
 HOLD_STEPS, RELIGHT_STEPS = 1, 14
 """Steps where the light depends on the materials and is renewed at each."""
 
@@ -172,7 +169,6 @@ def _find_light(
         unit,
         start.undetermined,
         out_of_time=pace.light_is_over,
-        cg_steps=LIGHT_CG_STEPS,
     )
     shown = torch.from_numpy(start.base_color) ** start.response.gamma
     mean = torch.cat([shown.median(dim=0).values, torch.tensor([roughness_to_raw(ROUGHNESS_MEAN)])])
