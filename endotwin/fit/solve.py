@@ -40,7 +40,7 @@ LIGHT_COARSEST_MM = 12.0
 """Cells of the features beside which light and response are found, in units of the scene."""
 
 LIGHT_PIXELS, LIGHT_STEPS = 400_000, 4
-HOLD_STEPS, RELIGHT_STEPS = 1, 14
+HOLD_STEPS, RELIGHT_STEPS = 1, 9
 """Steps where the light depends on the materials and is renewed at each."""
 
 LIGHT_SHARE = 0.25
