@@ -14,7 +14,7 @@ from endotwin import shading
 from endotwin.casting import Caster, Correspondences
 from endotwin.effects.coat import F0_WATER
 from endotwin.guides import AT_LENS, Guided, guided, log_axis, visible_from
-from endotwin.incidence import incidence_on
+from endotwin.incidence import COS_MIN, incidence_on
 from endotwin.radiosity import Radiosity
 from endotwin.twin import Twin
 
@@ -88,18 +88,16 @@ class ViewLight:
         if self.twin.effects.guides_mm is None:
             x = self._at_lens(hits, directions, normals, diffuse, material[:, 3])
         else:
-            view = directions.reshape(-1, 3).take(hits.pixel, axis=0)
-            points_mm = view * hits.distance_mm[:, None]
+            points_mm = directions.reshape(-1, 3).take(hits.pixel, axis=0) * hits.distance_mm[:, None]
             guides_mm = np.asarray(self.twin.effects.guides_mm, np.float32)
             if "shadows" in self.twin.effects:
                 visible = visible_from(self.caster, self.T_local_camera, points_mm, guides_mm)
             lit = guided(points_mm, normals, guides_mm, self.twin.effects.profile, visible)
-            cos_o = torch.from_numpy(np.clip(-(normals * view).sum(axis=1), 1e-4, 1))
+            cos_o = _cos_o(hits, directions, normals)
             x = self._beside_lens(lit, cos_o, diffuse, material[:, 3])
         if self.irradiance is not None:
             bounced = torch.from_numpy(hits.interpolate(self.twin.surface, self.irradiance))
-            view = directions.reshape(-1, 3).take(hits.pixel, axis=0)
-            cos_o = torch.from_numpy(np.clip(-(normals * view).sum(axis=1), 1e-4, 1))
+            cos_o = _cos_o(hits, directions, normals)
             glossy = shading.specular_of_even_light(cos_o, material[:, 3], self.twin.materials.f0)[:, None]
             x = x + bounced * (diffuse + glossy / math.pi) * (2 * math.pi * self.twin.light.L0)
         return x, visible
@@ -150,3 +148,9 @@ class ViewLight:
             coat = self.twin.effects["coat"]
             lobes.append((coat.weight * F0_WATER, torch.full_like(roughness, coat.roughness)))
         return lobes
+
+
+def _cos_o(hits: Correspondences, directions: np.ndarray, normals: np.ndarray) -> Tensor:
+    """n·wo of hits, float32 [N], at least COS_MIN."""
+    view = directions.reshape(-1, 3).take(hits.pixel, axis=0)
+    return torch.from_numpy(np.clip(-(normals * view).sum(axis=1), COS_MIN, 1))

@@ -131,6 +131,11 @@ class Renderer:
         color = shading.respond(torch.from_numpy(radiance), self.twin.response.gamma).clamp(0, 1).numpy()
         return View(color, radiance, hits, shape, self, normals)
 
+    @property
+    def nbytes(self) -> int:
+        """Memory of what the effects keep between views, bytes."""
+        return self._illumination.nbytes
+
     @cached_property
     def _transmission(self) -> np.ndarray | None:
         """Share of the light that the lens passes, float32 [H, W, 1]; None: all."""

@@ -91,9 +91,8 @@ def specular(
     """White GGX lobe f_s = D·F·G / (4 cos_i cos_o), [N]; ``cos_d`` = wi·wm enters Schlick's F = f0 + (1 −
     f0)(1 − cos_d)⁵.
     """
-    alpha = roughness.clamp_min(ROUGHNESS_MIN) ** 2
     fresnel = f0 + (1 - f0) * (1 - cos_d) ** 5
-    return ggx(sin2_m, alpha) * smith_visibility(cos_i, cos_o, alpha) * fresnel
+    return specular_lobe(cos_i, cos_o, sin2_m, roughness) * fresnel
 
 
 def specular_lobe(cos_i: Tensor, cos_o: Tensor, sin2_m: Tensor, roughness: Tensor) -> Tensor:
@@ -105,8 +104,7 @@ def specular_lobe(cos_i: Tensor, cos_o: Tensor, sin2_m: Tensor, roughness: Tenso
 
 def specular_colocated(cos: Tensor, sin2: Tensor, roughness: Tensor) -> Tensor:
     """``specular`` per unit of f0, with the light at the lens: wi = wo = wm, so cos_d = 1 and F = f0."""
-    alpha = roughness.clamp_min(ROUGHNESS_MIN) ** 2
-    return ggx(sin2, alpha) * smith_visibility(cos, cos, alpha)
+    return specular_lobe(cos, cos, sin2, roughness)
 
 
 def specular_of_even_light(cos_o: Tensor, roughness: Tensor, f0: float) -> Tensor:

@@ -1,6 +1,8 @@
 """Fixtures shared by all tests."""
 
 import os
+import signal
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -18,3 +20,12 @@ def data_root() -> Path:
 def example() -> Path:
     """The bundled example sequence."""
     return Path(__file__).parents[1] / "examples" / "colon_small"
+
+
+@pytest.fixture(autouse=True)
+def signals() -> Iterator[None]:
+    """``main`` takes SIGINT and SIGTERM over; give them back to the test runner."""
+    kept = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    yield
+    for number, handler in kept.items():
+        signal.signal(number, handler)

@@ -3,8 +3,8 @@
 import json
 
 import pytest
+from command_line import invoke
 from damaged import DAMAGES, Copy
-from test_cli import invoke, signals  # noqa: F401
 
 
 def test_exit_code_0_and_a_table_where_all_agrees(example, capsys):

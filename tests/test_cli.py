@@ -8,7 +8,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -16,28 +16,11 @@ import numpy as np
 import pytest
 import tifffile
 import tube_sequence
+from command_line import invoke
 from endotwin.cli import console
-from endotwin.cli.main import main
 from endotwin.cli.stop import Stopped, heed_signals
 
 FRAMES = 10
-
-
-@pytest.fixture(autouse=True)
-def signals() -> Iterator[None]:
-    """``main`` takes SIGINT and SIGTERM over; give them back to the test runner."""
-    kept = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-    yield
-    for number, handler in kept.items():
-        signal.signal(number, handler)
-
-
-def invoke(*arguments: object) -> int:
-    """Run the command line in this process; its exit code."""
-    with pytest.MonkeyPatch.context() as patch, pytest.raises(SystemExit) as exit_:
-        patch.setattr(sys, "argv", ["endotwin", *map(str, arguments)])
-        main()
-    return exit_.value.code or 0
 
 
 @pytest.fixture

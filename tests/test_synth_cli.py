@@ -20,15 +20,6 @@ from endotwin.synth import DEFAULT_LABELS, LABELS, LAYOUTS
 FRAMES = 40
 
 
-@pytest.fixture(autouse=True)
-def signals():
-    """``main`` takes SIGINT and SIGTERM over; give them back to the test runner."""
-    kept = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-    yield
-    for number, handler in kept.items():
-        signal.signal(number, handler)
-
-
 @pytest.fixture(scope="module")
 def made(tmp_path_factory):
     """A folder with a twin, a pose file of its lumen, a camera and a file of ranges."""

@@ -78,6 +78,19 @@ def scaled_centre(coordinate: float, ratio: float) -> float:
     return (coordinate + 0.5) * ratio - 0.5
 
 
+def scaled_lengths(camera: Camera, scale: float) -> dict[str, float]:
+    """Size, focal lengths and centre, at ``scale``, of a camera that has ``fx`` and ``fy``."""
+    width, height, ratio_x, ratio_y = scaled_size(camera, scale)
+    return {
+        "width": width,
+        "height": height,
+        "fx": camera.fx * ratio_x,
+        "fy": camera.fy * ratio_y,
+        "cx": scaled_centre(camera.cx, ratio_x),
+        "cy": scaled_centre(camera.cy, ratio_y),
+    }
+
+
 def first_positive_root(polynomial: Polynomial) -> float:
     """The least real root greater than 0, inf where there is none."""
     roots = polynomial.trim().roots()

@@ -13,8 +13,7 @@ from endotwin.cameras.base import (
     Camera,
     first_positive_root,
     inverse_of_increasing,
-    scaled_centre,
-    scaled_size,
+    scaled_lengths,
 )
 
 
@@ -65,13 +64,4 @@ class Fisheye(Camera):
         return distorted * (self.fx, self.fy) + (self.cx, self.cy)
 
     def scaled(self, scale: float) -> Fisheye:
-        width, height, ratio_x, ratio_y = scaled_size(self, scale)
-        return replace(
-            self,
-            width=width,
-            height=height,
-            fx=self.fx * ratio_x,
-            fy=self.fy * ratio_y,
-            cx=scaled_centre(self.cx, ratio_x),
-            cy=scaled_centre(self.cy, ratio_y),
-        )
+        return replace(self, **scaled_lengths(self, scale))

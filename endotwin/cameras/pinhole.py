@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.polynomial import Polynomial
 
-from endotwin.cameras.base import Camera, first_positive_root, scaled_centre, scaled_size
+from endotwin.cameras.base import Camera, first_positive_root, scaled_lengths
 
 NEWTON_STEPS = 30
 CONVERGED = 1e-11  # in normalised coordinates, before the last step
@@ -87,16 +87,7 @@ class Pinhole(Camera):
         return xy * (self.fx, self.fy) + (self.cx, self.cy)
 
     def scaled(self, scale: float) -> Pinhole:
-        width, height, ratio_x, ratio_y = scaled_size(self, scale)
-        return replace(
-            self,
-            width=width,
-            height=height,
-            fx=self.fx * ratio_x,
-            fy=self.fy * ratio_y,
-            cx=scaled_centre(self.cx, ratio_x),
-            cy=scaled_centre(self.cy, ratio_y),
-        )
+        return replace(self, **scaled_lengths(self, scale))
 
     def _distorted(self, xy: np.ndarray) -> np.ndarray:
         """Distorted normalised coordinates [N, 2] of undistorted ones [N, 2]."""

@@ -12,7 +12,7 @@ from endotwin.effects.coat import Coat
 from endotwin.effects.gain import Gain
 from endotwin.effects.interreflection import Interreflection, bounced, cell_mm
 from endotwin.effects.offset import MOST_GUIDES, Offset, Search, shadow_columns
-from endotwin.effects.probe import Hypothesis, Probe, Verdict
+from endotwin.effects.probe import Fitted, Hypothesis, Probe, Verdict
 from endotwin.effects.profile import Profile
 from endotwin.effects.shadows import Shadows
 from endotwin.effects.specular import Specular
@@ -67,6 +67,8 @@ class _Trial:
         self._left = [name for name in ORDER if self.wanted(name) == "auto"]
         self._seconds = dict.fromkeys((*ORDER, "shadows"), 0.0)
         self._decisions: dict[str, Decision] = {}
+        self._tried_last: dict[str, Verdict] = {}
+        self._found: dict[str, Fitted] = {}
 
     def wanted(self, name: str) -> str:
         return self._wanted.get(name, "auto")
@@ -80,17 +82,16 @@ class _Trial:
 
     def adopt(self, name: str, verdict: Verdict | None) -> None:
         """Keep the effect; of an offset, only if what is found of it predicts better too."""
-        began = time.perf_counter()
         if name in self._left:
             self._left.remove(name)
         if name == "offset":
+            began = time.perf_counter()
             self._adopt_offset(forced=verdict is None)
+            self._seconds[name] += time.perf_counter() - began
         else:
-            found = self._probe.fit(self._hypothesis(name))
-            verdict = verdict or self._probe.compare(self._kept, found)
-            self._kept = found
+            verdict = verdict or self._tried(name)
+            self._kept = self._found[name]
             self._decide(name, "on", _reason(verdict, self.wanted(name)), verdict)
-        self._seconds[name] += time.perf_counter() - began
 
     def decided(self) -> Decided:
         """What was kept, and why not the rest."""
@@ -137,6 +138,7 @@ class _Trial:
             other = self._probe.with_columns(self._kept, shadow_columns(self._probe))
         else:
             other = self._probe.fit(self._hypothesis(name))
+        self._found[name] = other
         verdict = self._probe.compare(self._kept, other)
         self._seconds[name] += time.perf_counter() - began
         return verdict

@@ -22,33 +22,28 @@ def priced(twin: Twin, caster: Caster) -> Twin:
     decisions = {**twin.decisions, **_rendered(twin)}
     dear = [name for name in twin.effects if name in decisions and name != "specular"]
     if dear:
-        whole_ms = _frame_ms(twin, caster)
+        whole = Renderer(twin, caster=caster)
+        whole_ms = _frame_ms(whole)
         for name in dear:
             gone = {"offset": ("offset", "shadows")}.get(name, (name,))
-            other_ms = _frame_ms(replace(twin, effects=twin.effects.without(gone)), caster)
+            other_ms = _frame_ms(Renderer(replace(twin, effects=twin.effects.without(gone)), caster=caster))
             decisions[name] = replace(
                 decisions[name],
                 render_ms=round(max(0.0, whole_ms - other_ms), 1),
-                memory_mb=round(_memory_mb(twin, name, caster), 1),
+                memory_mb=round(whole.nbytes / 1e6, 1) if name == "interreflection" else 0.0,
             )
     return replace(twin, decisions=decisions)
 
 
-def _frame_ms(twin: Twin, caster: Caster) -> float:
+def _frame_ms(renderer: Renderer) -> float:
     """Best of a few renderings of the sequence's middle frame."""
-    renderer, poses = Renderer(twin, caster=caster), twin.source.open().T_world_camera
+    poses = renderer.twin.source.open().T_world_camera
     best = float("inf")
     for _ in range(REPEATS):
         began = time.perf_counter()
         renderer.view(poses[len(poses) // 2])
         best = min(best, 1e3 * (time.perf_counter() - began))
     return best
-
-
-def _memory_mb(twin: Twin, name: str, caster: Caster) -> float:
-    from endotwin.illumination import Illumination
-
-    return Illumination(twin, caster).nbytes / 1e6 if name == "interreflection" else 0.0
 
 
 def _rendered(twin: Twin) -> dict[str, Decision]:

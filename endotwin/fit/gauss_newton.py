@@ -20,7 +20,7 @@ from torch import Tensor
 
 from endotwin.fit.model import Globals, at_pixels, predict
 from endotwin.fit.normal import CHANNELS, MeshPattern, NormalEquations, assemble, robust_cost
-from endotwin.fit.samples import Samples
+from endotwin.fit.samples import Samples, drawn
 from endotwin.fit.start import PRIOR
 from endotwin.hashgrid import HashOperator
 from endotwin.shading import F0_DIELECTRIC
@@ -143,7 +143,8 @@ class GaussNewton:
         self._unit_mm = unit_mm
         self.held = held
         self.out_of_time = out_of_time
-        self._trial_rows = _drawn(len(samples), SEARCH_SAMPLES, seed)
+        chosen = drawn(len(samples), SEARCH_SAMPLES, np.random.default_rng(seed))
+        self._trial_rows = torch.from_numpy(chosen)
         self.relight(samples)
         self.squared_adjoint = _squared(operator.adjoint_csr)
 
@@ -323,14 +324,6 @@ def at_bounds(shared: Globals) -> list[str]:
 def _bounded(shared: Globals, vector: Tensor) -> Globals:
     limits = torch.tensor(GLOBAL_RANGE, dtype=torch.float64)[: len(vector)]
     return replace(shared, vector=torch.clamp(vector, limits[:, 0], limits[:, 1]))
-
-
-def _drawn(count: int, wanted: int, seed: int) -> Tensor:
-    """About ``wanted`` of ``count`` rows, ascending; all if there are no more."""
-    if count <= wanted:
-        return torch.arange(count)
-    chosen = np.random.default_rng(seed).random(count, np.float32) < wanted / count
-    return torch.from_numpy(np.flatnonzero(chosen))
 
 
 def _squared(matrix: Tensor) -> Tensor:

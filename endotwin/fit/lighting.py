@@ -16,7 +16,7 @@ from endotwin.fit.gauss_newton import HUBER, GaussNewton, State
 from endotwin.fit.model import Globals, at_pixels, slope_by_log_exposure
 from endotwin.fit.normal import Residual
 from endotwin.fit.samples import Bounce, Samples
-from endotwin.guides import Guided, guided, log_axis, visible_from
+from endotwin.guides import AT_LENS, Guided, guided, log_axis, visible_from
 from endotwin.incidence import unit
 from endotwin.radiosity import Radiosity
 from endotwin.twin import Twin
@@ -113,7 +113,7 @@ class Bouncer:
         self._surface, self._frames = surface, frames
         self._radiosity = Radiosity(surface, caster, effects["interreflection"].cell_mm)
         poses = twin.source.open().T_world_camera
-        guides = effects.guides_mm or ((0.0, 0.0, 0.0),)
+        guides = effects.guides_mm or AT_LENS
         self._lamps = [
             [
                 self._radiosity.lamp(surface.to_local(poses[int(frame)]), np.asarray(guide), effects.profile)

@@ -92,14 +92,19 @@ class Samples:
         """About ``count`` of the samples, drawn evenly at random; all of them if there are no more."""
         if len(self) <= count:
             return self
-        return self[
-            torch.from_numpy(np.flatnonzero(generator.random(len(self), np.float32) < count / len(self)))
-        ]
+        return self[torch.from_numpy(drawn(len(self), count, generator))]
 
     def chunks(self, size: int) -> Iterator[Samples]:
         """Consecutive pieces of at most ``size`` samples."""
         for start in range(0, len(self), size):
             yield self[start : start + size]
+
+
+def drawn(count: int, wanted: int, generator: np.random.Generator) -> np.ndarray:
+    """About ``wanted`` of ``count`` rows, drawn evenly at random, ascending; all if there are no more."""
+    if count <= wanted:
+        return np.arange(count)
+    return np.flatnonzero(generator.random(count, np.float32) < wanted / count)
 
 
 def gather(twin: Twin, pace: Pace, seed: int, caster: Caster) -> Samples:

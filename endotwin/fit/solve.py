@@ -24,7 +24,7 @@ from endotwin.fit.gauss_newton import ROUGHNESS_MEAN, GaussNewton, State, at_bou
 from endotwin.fit.lighting import Relighting, lit
 from endotwin.fit.model import Globals
 from endotwin.fit.pace import ITERATIONS, LIGHT, Pace
-from endotwin.fit.samples import THREADS, Samples, gather
+from endotwin.fit.samples import THREADS, Samples, drawn, gather
 from endotwin.fit.start import ALBEDO_TOP, BRIGHT, Start, closed_form, start_at
 from endotwin.fit.tilt import tilted
 from endotwin.fit.unit import unit_mm
@@ -103,7 +103,9 @@ def fit_twin(twin: Twin, pace: Pace, seed: int, states: Mapping[str, str]) -> Tw
                     "no training photo of %s has an unclipped pixel: its light and materials are guesses",
                     twin.source.path,
                 )
-        telling = torch.from_numpy(_thinned(telling, pace.start_pixels, seed))
+        telling = torch.from_numpy(
+            telling[drawn(len(telling), pace.start_pixels, np.random.default_rng(seed))]
+        )
         start = closed_form(samples[telling], surface.triangles, len(surface.vertices_mm))
     if start.undetermined:
         logger.warning("the photos cannot tell %s: kept at the prior", " and ".join(start.undetermined))
@@ -122,7 +124,7 @@ def fit_twin(twin: Twin, pace: Pace, seed: int, states: Mapping[str, str]) -> Tw
         samples = lit(samples, twin, caster, decided.effects)
     with stopwatch.stage("light"):
         count = min(LIGHT_PIXELS, int(LIGHT_SHARE * pace.start_pixels))
-        rows = torch.from_numpy(_thinned(telling.numpy(), count, seed))
+        rows = telling[torch.from_numpy(drawn(len(telling), count, np.random.default_rng(seed)))]
         state, cost = _find_light(samples[rows], surface, start, pace, relighting)
     with stopwatch.stage("detail"):
         state, normals = _find_detail(samples, twin, state, cost, pace, relighting)
@@ -139,13 +141,6 @@ def fit_twin(twin: Twin, pace: Pace, seed: int, states: Mapping[str, str]) -> Tw
     return fitted.with_record(
         fit={"method": "twin", "undetermined": list(start.undetermined), **stopwatch.to_dict()}
     )
-
-
-def _thinned(rows: np.ndarray, count: int, seed: int) -> np.ndarray:
-    """About ``count`` of ``rows`` [N], drawn evenly at random in their order; all if there are no more."""
-    if len(rows) <= count:
-        return rows
-    return rows[np.random.default_rng(seed).random(len(rows), np.float32) < count / len(rows)]
 
 
 def _telling(samples: Samples, surface: Surface) -> np.ndarray:

@@ -14,6 +14,7 @@ import numpy as np
 import torch
 
 from endotwin import shading
+from endotwin.fit.fixed_effects import HUBER, without_means
 from endotwin.fit.samples import Samples
 from endotwin.twin import Light, Response
 
@@ -27,7 +28,6 @@ HIGHLIGHT_SIN2 = 0.06
 """Nearer than asin √0.06 ≈ 14° to the mirror direction a highlight may be what is seen."""
 
 COS_MIN = 0.1
-HUBER = 1.345
 ROUNDS = 6
 LEAST_TOLD = 0.015
 """The photos do not tell a combination of γ(n − n₀), γ(q − q₀) and γ with a larger standard error: what the
@@ -108,8 +108,8 @@ def _coefficients(
     prior = np.array([0.0, 0.0, PRIOR["gamma"]])
     weight, change, told = np.ones(len(target)), np.zeros(3), np.zeros(3, bool)
     for _ in range(ROUNDS if len(target) > 3 else 0):
-        centred = _without_vertex_means(columns, weight, vertex, count)
-        residual = _without_vertex_means(target, weight, vertex, count)[:, 0] - centred @ prior
+        centred = without_means(columns, weight, vertex, count)
+        residual = without_means(target, weight, vertex, count)[:, 0] - centred @ prior
         left = np.abs(residual - centred @ change)
         width = max(1.4826 * np.median(left), 1e-9)
         weight = np.minimum(1, HUBER * width / np.maximum(left, 1e-12))
@@ -138,15 +138,6 @@ def _sightings(vertex: np.ndarray, frame: np.ndarray, values: np.ndarray) -> tup
     )
     means = [np.bincount(which, column, len(key)) / pixels for column in values.T]
     return key >> 32, np.stack(means, axis=1)
-
-
-def _without_vertex_means(
-    values: np.ndarray, weight: np.ndarray, vertex: np.ndarray, count: int
-) -> np.ndarray:
-    """Values [N, K] less the weighted mean of each vertex: the within-vertex variation."""
-    total = np.maximum(np.bincount(vertex, weight, count), 1e-12)
-    means = [np.bincount(vertex, weight * column, count) / total for column in values.T]
-    return values - np.stack([mean[vertex] for mean in means], axis=1)
 
 
 def _told_change(normal: np.ndarray, right: np.ndarray, noise: float) -> tuple[np.ndarray, np.ndarray]:

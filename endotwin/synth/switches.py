@@ -10,10 +10,10 @@ import numpy as np
 from endotwin.effects import FITTED, NAMES, RENDERED, Effects, effect_class
 from endotwin.effects.offset import Offset
 from endotwin.errors import OptionError
+from endotwin.guides import AT_LENS
 from endotwin.synth.edits import OFFSETS, Edit
 from endotwin.twin import Twin
 
-AT_LENS = ((0.0, 0.0, 0.0),)
 NEED_VELOCITY = ("motion_blur", "rolling_shutter")
 
 

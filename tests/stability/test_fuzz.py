@@ -1,17 +1,14 @@
 """Damaged files: every reader and every command answers with one sentence, never with a traceback."""
 
 import shutil
-import signal
-import sys
 import warnings
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
 import tube_sequence
+from command_line import invoke
 from damage import WRITERS, Files, damaged, files_of
-from endotwin.cli.main import main
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
@@ -65,23 +62,6 @@ def made(tmp_path_factory) -> Path:
     tube_sequence.write(folder / "tube", 4, 48, 36)
     endotwin.fit_twin(endotwin.fuse_twin(folder / "tube")).save(folder / "twin")
     return folder
-
-
-@pytest.fixture(autouse=True)
-def signals() -> Iterator[None]:
-    """``main`` takes SIGINT and SIGTERM over; give them back to the test runner."""
-    kept = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-    yield
-    for number, handler in kept.items():
-        signal.signal(number, handler)
-
-
-def invoke(*arguments: object) -> int:
-    """Run the command line in this process; its exit code. Anything but SystemExit fails the test."""
-    with pytest.MonkeyPatch.context() as patch, pytest.raises(SystemExit) as exit_:
-        patch.setattr(sys, "argv", ["endotwin", *map(str, arguments)])
-        main()
-    return exit_.value.code or 0
 
 
 def spoil_and_run(contents: Files, data: st.DataObject, out: Path, *command: object) -> None:
