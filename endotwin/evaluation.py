@@ -9,6 +9,9 @@ The held-out frames are rendered at their own poses and compared with their phot
   photo. The rest of a held-out frame shows what no training photo showed. The definition is by surface: where
   the mesh is wrong, so that a ray ends on another part of the colon that was seen, the error counts.
 - all others are ignored.
+
+Where the camera changes its gain, that of a held-out frame is one number that no other photo tells. It is
+read from the frame's own photo, as the median of photo over twin, and kept with the scores.
 """
 
 from __future__ import annotations
@@ -22,7 +25,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from endotwin import metrics
+from endotwin import metrics, shading
 from endotwin.casting import Correspondences
 from endotwin.errors import TwinError
 from endotwin.output import check_picture, whole_file
@@ -38,6 +41,9 @@ Progress = Callable[[str, int, int], None]
 SHEET_WIDTH = 320
 """Width in pixels of one picture of the contact sheet."""
 
+MID_TONES = (0.1, 0.9)
+"""Display values that are neither noise nor clipped."""
+
 POOR_DB = 20.0
 """A twin with a lower PSNR does not look like its photos."""
 
@@ -51,6 +57,7 @@ class FrameScore:
 
     Attributes:
         index, name: which frame.
+        gain: factor on the twin's radiance that its photo shows; 1 where the camera keeps its gain.
         psnr, ssim, lpips: over its valid pixels.
         psnr_covered, ssim_covered, lpips_covered: over its covered pixels.
         covered: fraction of the valid pixels that are covered.
@@ -58,6 +65,7 @@ class FrameScore:
 
     index: int
     name: str
+    gain: float
     psnr: float
     ssim: float
     lpips: float
@@ -127,7 +135,8 @@ class Evaluation:
         }
 
     def __str__(self) -> str:
-        scores = [field.name for field in fields(FrameScore) if field.name not in ("index", "name")]
+        told = {"index", "name"} | ({"gain"} if all(frame.gain == 1 for frame in self.frames) else set())
+        scores = [field.name for field in fields(FrameScore) if field.name not in told]
         rows = [["frame", *scores]]
         for frame in self.frames:
             rows.append([frame.name, *(_shown(name, getattr(frame, name)) for name in scores)])
@@ -155,17 +164,30 @@ def covered_pixels(hits: Correspondences, surface: Surface, shape: tuple[int, in
     return covered.reshape(shape)
 
 
+def gain_of(photo: np.ndarray, radiance: np.ndarray, gamma: float) -> float:
+    """Factor on ``radiance`` [H, W, 3] that makes it look like ``photo`` (display-encoded, of its shape).
+
+    The median of their ratio over mid-tones, which highlights and shadows' edges do not move; 1 where there
+    are none.
+    """
+    tells = (photo > MID_TONES[0]) & (photo < MID_TONES[1]) & (radiance > 0)
+    ratio = shading.radiance_of(photo[tells], gamma) / radiance[tells]
+    return float(np.median(ratio)) if ratio.size else 1.0
+
+
 @dataclass(frozen=True)
 class _HeldOut:
     """A held-out frame beside its rendering.
 
     Attributes:
-        photo, render: float32 [H, W, 3], display-encoded, in [0, 1]. valid, covered: bool [H, W].
+        photo, render: float32 [H, W, 3], display-encoded, in [0, 1]. gain: factor on the radiance that was
+            rendered. valid, covered: bool [H, W].
     """
 
     frame: Frame
     photo: np.ndarray
     render: np.ndarray
+    gain: float
     valid: np.ndarray
     covered: np.ndarray
 
@@ -183,9 +205,13 @@ def _held_out(twin: Twin, progress: Progress | None) -> Iterator[_HeldOut]:
         if not valid.any():
             logger.warning("Held-out frame %s has no valid pixel and is not scored.", frame.name)
             continue
-        view = renderer.view(frame.T_world_camera, valid, twin.exposure(index))
+        photo = frame.color.astype(np.float32) / 255
+        view, gain = renderer.view(frame.T_world_camera, valid), 1.0
+        if "gain" in twin.effects:
+            gain = gain_of(photo, view.radiance, twin.response.gamma)
+            view = renderer.view(frame.T_world_camera, valid, gain)
         covered = covered_pixels(view.hits, twin.surface, valid.shape)
-        yield _HeldOut(frame, frame.color.astype(np.float32) / 255, view.color, valid, covered)
+        yield _HeldOut(frame, photo, view.color, gain, valid, covered)
     if progress:
         progress("held-out frames", len(indices), len(indices))
 
@@ -199,6 +225,7 @@ def _score(held_out: _HeldOut) -> FrameScore:
     return FrameScore(
         index=held_out.frame.index,
         name=held_out.frame.name,
+        gain=held_out.gain,
         psnr=metrics.psnr(photo, render, valid),
         ssim=metrics.masked_mean(similarity, valid),
         lpips=metrics.masked_mean(distance, valid),

@@ -131,3 +131,8 @@ def respond(radiance: Tensor, gamma: float | Tensor) -> Tensor:
     """
     gamma = torch.as_tensor(gamma, dtype=radiance.dtype)
     return torch.exp(gamma * torch.log(radiance + RADIANCE_MIN)) - torch.exp(gamma * math.log(RADIANCE_MIN))
+
+
+def radiance_of(color: np.ndarray, gamma: float) -> np.ndarray:
+    """Radiance x that ``respond`` shows as C = ``color`` below 1, of its shape."""
+    return (color + RADIANCE_MIN**gamma) ** (1 / gamma) - RADIANCE_MIN

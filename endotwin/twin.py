@@ -147,10 +147,6 @@ class Twin:
         """The same twin with ``entries`` added to its record."""
         return replace(self, record={**self.record, **entries})
 
-    def exposure(self, frame: int) -> float:
-        """Factor on the radiance of the sequence's frame with this index: its gain, where gain was found."""
-        return float(self.effects["gain"].of(np.array([frame]))[0]) if "gain" in self.effects else 1.0
-
     def at_scale(self, scale: float) -> Twin:
         """The same twin, seen by its camera with images of another factor of the photos' size."""
         source = replace(self.source, scale=scale)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import tube_sequence
 
+from endotwin.effects.gain import Gain
 from endotwin.errors import OutputError, SequenceError, TwinError
 from endotwin.evaluation import evaluate
 from endotwin.pipeline import fuse_twin
@@ -51,6 +52,17 @@ def test_a_wrong_response_costs_what_its_closed_form_says(twin):
     expected = -10 * np.log10(np.mean(error**2))
     assert color.max() < 1
     assert evaluate(darker).frames[0].psnr == pytest.approx(expected, abs=0.15)
+
+
+def test_the_gain_of_a_held_out_frame_is_read_from_its_photo(twin):
+    gain = Gain(frames=(1, 2), log_gain=(0.1, -0.1))
+    automatic = replace(twin, effects=twin.effects.including(gain))
+    brighter = replace(automatic, light=replace(twin.light, L0=twin.light.L0 * 1.25))
+    frames = evaluate(brighter).frames
+    assert [frame.gain for frame in frames] == pytest.approx([0.8] * 2, rel=0.005)
+    assert evaluate(brighter).psnr == pytest.approx(evaluate(twin).psnr, abs=0.2)
+    assert [frame.gain for frame in evaluate(twin).frames] == [1.0] * len(frames)
+    assert "gain" in str(evaluate(brighter)) and "gain" not in str(evaluate(twin))
 
 
 def test_covered_pixels_are_those_whose_surface_a_training_photo_saw(twin):

@@ -210,6 +210,8 @@ def test_response_is_a_power_that_starts_at_zero_with_a_finite_slope():
         assert (shown[1:] > shown[:-1]).all()
         slope = torch.autograd.grad(shown.sum(), x)[0]
         assert torch.isfinite(slope).all() and (slope > 0).all()
+        back = shading.radiance_of(shown.detach().numpy(), gamma)
+        np.testing.assert_allclose(back, x.detach().numpy(), rtol=1e-9, atol=1e-15)
     half_a_step = 0.5 / 255
     np.testing.assert_allclose(
         shading.respond(x, 1 / 2.2).detach()[2:], x.detach().numpy()[2:] ** (1 / 2.2), atol=1.01 * half_a_step

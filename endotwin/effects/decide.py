@@ -25,6 +25,9 @@ from endotwin.twin import Light, Twin
 ORDER = ("offset", "interreflection", "gain", "profile", "vignetting")
 """Effects that are tried, each beside those already kept; the strongest first."""
 
+MIN_GAIN_BESIDE_BOUNCE_DB = 0.5
+"""Bounced light is known by patches only: gain or profile could mend by 0.2 dB what that lacks."""
+
 
 @dataclass(frozen=True)
 class Decided:
@@ -77,8 +80,16 @@ class _Trial:
         """The effect that gains most beside those kept, if any is worth keeping."""
         tried = {name: self._tried(name) for name in self._left if self._possible(name)}
         self._tried_last = tried
-        name = max(tried, key=lambda name: tried[name].gain_db, default=None)
-        return (name, tried[name]) if name is not None and tried[name].keep else None
+        worth = [name for name, verdict in tried.items() if self._worth(name, verdict)]
+        name = max(worth, key=lambda name: tried[name].gain_db, default=None)
+        return None if name is None else (name, tried[name])
+
+    def _worth(self, name: str, verdict: Verdict) -> bool:
+        """Whether to adopt: an offset has to prove itself then, so that a hint is enough."""
+        if name == "offset":
+            return verdict.hints
+        bounced = self._kept.hypothesis.bounced is not None
+        return verdict.keep and (not bounced or verdict.gain_db >= MIN_GAIN_BESIDE_BOUNCE_DB)
 
     def adopt(self, name: str, verdict: Verdict | None) -> None:
         """Keep the effect; of an offset, only if what is found of it predicts better too."""
@@ -91,6 +102,10 @@ class _Trial:
         else:
             verdict = verdict or self._tried(name)
             self._kept = self._found[name]
+            if self._kept.hypothesis.guides_mm != AT_LENS:
+                began = time.perf_counter()
+                self._kept = self._probe.fit(Search(self._probe, self._kept).polished())
+                self._seconds["offset"] += time.perf_counter() - began
             self._decide(name, "on", _reason(verdict, self.wanted(name)), verdict)
 
     def decided(self) -> Decided:
@@ -134,14 +149,21 @@ class _Trial:
 
     def _tried(self, name: str) -> Verdict:
         began = time.perf_counter()
+        base = self._kept
         if name == "offset":
-            other = self._probe.with_columns(self._kept, shadow_columns(self._probe))
+            base = self._vignetted(base.hypothesis)
+            other = self._probe.with_columns(base, shadow_columns(self._probe))
         else:
             other = self._probe.fit(self._hypothesis(name))
         self._found[name] = other
-        verdict = self._probe.compare(self._kept, other)
+        verdict = self._probe.compare(base, other)
         self._seconds[name] += time.perf_counter() - began
         return verdict
+
+    def _vignetted(self, hypothesis: Hypothesis) -> Fitted:
+        """The hypothesis with a vignetting beside it: guides are sought so, lest what the lens swallows pass
+        for one more."""
+        return self._probe.fit(replace(hypothesis, vignetting=self.wanted("vignetting") != "off"))
 
     def _hypothesis(self, name: str) -> Hypothesis:
         kept = self._kept.hypothesis
@@ -152,8 +174,9 @@ class _Trial:
         return replace(kept, **{name: True})
 
     def _adopt_offset(self, forced: bool) -> None:
-        base, search = self._kept, Search(self._probe, self._kept)
-        best = None
+        hypothesis = self._kept.hypothesis
+        base, best = self._vignetted(hypothesis), None
+        search = Search(self._probe, base)
         for number in range(1, MOST_GUIDES + 1):
             found = self._probe.fit(search.best(number, best))
             if (best is None and forced and number == 2) or self._probe.compare(best or base, found).keep:
@@ -163,7 +186,8 @@ class _Trial:
         if best is None:
             self._decide("offset", "off", "no position of one to three guides predicts better", None)
             return
-        verdict = self._probe.compare(base, best)
+        best = self._probe.fit(replace(best.hypothesis, vignetting=hypothesis.vignetting))
+        verdict = self._probe.compare(self._kept, best)
         unshadowed = self._probe.fit(replace(best.hypothesis, shadows=False))
         shadow = self._probe.compare(unshadowed, best)
         shadows = self.wanted("shadows") == "on" or (self.wanted("shadows") == "auto" and shadow.keep)

@@ -24,5 +24,5 @@ class Gain(Effect):
     log_gain: tuple[float, ...] = ()
 
     def of(self, frame: np.ndarray) -> np.ndarray:
-        """Gain of frames [N], float32 [N]; between training frames the logarithm is interpolated."""
-        return np.exp(np.interp(frame, self.frames, self.log_gain)).astype(np.float32)
+        """Gain of training frames [N], float32 [N]."""
+        return np.exp(np.asarray(self.log_gain)[np.searchsorted(self.frames, frame)]).astype(np.float32)

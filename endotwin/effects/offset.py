@@ -19,7 +19,8 @@ that sees the wall at 20 mm has its guides within some 4 mm."""
 RING_RADII = (0.5, 1.0)
 RING_POINTS = 8
 MOST_GUIDES = 3
-REFINE_STEPS = 90
+REFINE_STEPS, SPREAD = 90, 0.2
+POLISH_STEPS, POLISH_SPREAD = 30, 0.05
 TOLERANCE = 1e-3
 """The search ends when positions move by less than this share of the ring's radius, and the loss by less."""
 
@@ -71,16 +72,26 @@ class Search:
             known = np.asarray(fewer.hypothesis.guides_mm, np.float32)
             joined = [np.vstack([known, candidate]) for candidate in self._candidates]
             start_mm = min(joined, key=self._loss)
+        return self._refined(start_mm, REFINE_STEPS, SPREAD)
+
+    def polished(self) -> Hypothesis:
+        """The base with its own guides moved to where they predict best beside all that was kept since."""
+        base = self._base.hypothesis
+        refined = self._refined(np.asarray(base.guides_mm), POLISH_STEPS, POLISH_SPREAD)
+        return replace(refined, shadows=base.shadows)
+
+    def _refined(self, start_mm: np.ndarray, steps: int, spread: float) -> Hypothesis:
+        """Guides moved from ``start_mm`` [K, 3] by ``steps`` trials each, first by ``spread`` of the ring."""
         first = start_mm[:, :2].astype(np.float64).ravel() / self._radius_mm
         found = minimize(
             lambda x: self._loss(self._guides(x)),
             first,
             method="Nelder-Mead",
             options={
-                "maxfev": REFINE_STEPS * number,
+                "maxfev": steps * len(start_mm),
                 "xatol": TOLERANCE,
                 "fatol": TOLERANCE * self._loss(self._guides(first)),
-                "initial_simplex": _simplex(first),
+                "initial_simplex": np.vstack([first, first + spread * np.eye(len(first))]),
             },
         )
         return self._with(self._guides(found.x))
@@ -104,8 +115,3 @@ class Search:
     def _with(self, guides_mm: np.ndarray) -> Hypothesis:
         guides = tuple(tuple(float(c) for c in guide) for guide in guides_mm)
         return replace(self._base.hypothesis, guides_mm=guides, shadows=True)
-
-
-def _simplex(first: np.ndarray) -> np.ndarray:
-    """A starting simplex of a fifth of the ring's radius about ``first`` [D], [D + 1, D]."""
-    return np.vstack([first, first + 0.2 * np.eye(len(first))])

@@ -6,6 +6,8 @@ import time
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from endotwin.effects import RENDERED, Decision, effect_class
 from endotwin.render import Renderer
 
@@ -13,16 +15,21 @@ if TYPE_CHECKING:
     from endotwin.casting import Caster
     from endotwin.twin import Twin
 
-REPEATS = 2
+FREE = ("specular", "gain")
+"""Part of every rendering, and of none."""
+
+LEAST_S = 0.3
+"""Renderings are repeated for so long: the best of several small ones, a single large one."""
 
 
 def priced(twin: Twin, caster: Caster) -> Twin:
     """``twin`` with the price of each effect that is on in its decisions, and those only rendered in them
     too."""
     decisions = {**twin.decisions, **_rendered(twin)}
-    dear = [name for name in twin.effects if name in decisions and name != "specular"]
+    dear = [name for name in twin.effects if name in decisions and name not in FREE]
     if dear:
         whole = Renderer(twin, caster=caster)
+        whole.view(_middle_pose(twin))
         whole_ms = _frame_ms(whole)
         for name in dear:
             gone = {"offset": ("offset", "shadows")}.get(name, (name,))
@@ -36,14 +43,19 @@ def priced(twin: Twin, caster: Caster) -> Twin:
 
 
 def _frame_ms(renderer: Renderer) -> float:
-    """Best of a few renderings of the sequence's middle frame."""
-    poses = renderer.twin.source.open().T_world_camera
-    best = float("inf")
-    for _ in range(REPEATS):
+    """Best rendering of the sequence's middle frame."""
+    pose = _middle_pose(renderer.twin)
+    times_s: list[float] = []
+    while sum(times_s) < LEAST_S:
         began = time.perf_counter()
-        renderer.view(poses[len(poses) // 2])
-        best = min(best, 1e3 * (time.perf_counter() - began))
-    return best
+        renderer.view(pose)
+        times_s.append(time.perf_counter() - began)
+    return 1e3 * min(times_s)
+
+
+def _middle_pose(twin: Twin) -> np.ndarray:
+    poses = twin.source.open().T_world_camera
+    return poses[len(poses) // 2]
 
 
 def _rendered(twin: Twin) -> dict[str, Decision]:

@@ -39,6 +39,9 @@ MIN_SIGMAS = 4.0
 uncertainties. On a scene that has none of the effects, none gains 0.04 dB; on one that has it, each gains
 more than 1 dB."""
 
+HINT_DB, HINT_SIGMAS = 0.1, 2.0
+"""What is worth a longer look, which then has to be worth keeping."""
+
 
 @dataclass(frozen=True)
 class Bounced:
@@ -77,6 +80,10 @@ class Verdict:
     @property
     def keep(self) -> bool:
         return self.gain_db >= MIN_GAIN_DB and self.sigmas >= MIN_SIGMAS
+
+    @property
+    def hints(self) -> bool:
+        return self.gain_db >= HINT_DB and self.sigmas >= HINT_SIGMAS
 
     def __str__(self) -> str:
         return f"{self.gain_db:+.2f} dB, {self.sigmas:.0f} sigmas"

@@ -11,6 +11,7 @@ import torch
 from endotwin.casting import Caster
 from endotwin.config import STANDARD
 from endotwin.effects.decide import decide
+from endotwin.effects.vignetting import Vignetting
 from endotwin.fit.pace import Pace
 from endotwin.fit.samples import gather
 from endotwin.pipeline import fuse_twin
@@ -63,6 +64,16 @@ def test_gain_is_found_to_a_hundredth(example):
     assert np.abs(np.array(gain.log_gain) - (true - true.mean())).max() < 0.02
 
 
+def test_a_profile_that_is_no_cosine_is_found(example):
+    twin, caster, samples = example
+    cos_axis = samples.log_cos_axis.exp().numpy()
+    factor = (np.exp(-4 * (1 - cos_axis)) / cos_axis**2) ** (1 / 2.2)
+    color = np.uint8(np.clip(samples.color.numpy() * factor[:, None], 0, 255) + 0.5)
+    decided = decide(replace(samples, color=torch.from_numpy(color)), twin, caster, {})
+    assert states(decided) == {**dict.fromkeys(LIGHT, "off"), "profile": "on"}
+    assert decided.light.n == pytest.approx(4, rel=0.05)
+
+
 def test_an_effect_that_is_forced_off_stays_off(example):
     twin, caster, samples = example
     log_gain = np.random.default_rng(3).normal(0, 0.15, 64)
@@ -77,12 +88,41 @@ def test_interreflection_turns_itself_on_in_a_tube_that_has_it():
     assert states(decided) == {**dict.fromkeys(LIGHT, "off"), "interreflection": "on"}
 
 
+@pytest.fixture(scope="module")
+def lit_from_beside():
+    return scene(DATA / "colon_offset", 0.5)
+
+
+GUIDES_MM = [[-2.5, 1.0, 0.0], [2.5, 0.0, 0.0]]
+
+
 @needs_data
-def test_guides_are_found_within_half_a_millimetre_with_their_shadows():
-    decided = decide(*reordered(scene(DATA / "colon_offset", 0.5)), {})
+def test_guides_are_found_within_half_a_millimetre_with_their_shadows(lit_from_beside):
+    decided = decide(*reordered(lit_from_beside), {})
     assert states(decided) == {**dict.fromkeys(LIGHT, "off"), "offset": "on", "shadows": "on"}
-    guides_mm = np.array(sorted(decided.effects["offset"].guides_mm))
-    np.testing.assert_allclose(guides_mm, [[-2.5, 1.0, 0.0], [2.5, 0.0, 0.0]], atol=0.5)
+    np.testing.assert_allclose(sorted(decided.effects["offset"].guides_mm), GUIDES_MM, atol=0.5)
+
+
+@needs_data
+def test_vignetting_and_guides_are_told_apart(lit_from_beside):
+    twin, caster, samples = lit_from_beside
+    true = Vignetting(-0.5, -0.1)
+    decided = decide(vignetted(samples, twin, true), twin, caster, {})
+    on = dict.fromkeys(("offset", "shadows", "vignetting"), "on")
+    assert states(decided) == {**dict.fromkeys(LIGHT, "off"), **on}
+    np.testing.assert_allclose(sorted(decided.effects["offset"].guides_mm), GUIDES_MM, atol=0.5)
+    # Cosines of the profile can stand in for k2, so that only what the two pass together is told.
+    r2 = np.linspace(0, 1, 50)
+    cosine = -np.log1p(r2 * (0.5 / 0.6) ** 2) / 2
+    found = decided.effects["vignetting"]
+    passed = decided.light.n * cosine + found.k2 * r2 + found.k4 * r2**2
+    np.testing.assert_allclose(passed, cosine + true.k2 * r2 + true.k4 * r2**2, atol=0.03)
+
+
+def vignetted(samples, twin, vignetting: Vignetting):
+    """The samples as a lens with ``vignetting`` and a camera of gamma 2.2 would have shown them."""
+    passed = vignetting.transmission(twin.camera, samples.pixel.numpy()) ** (1 / 2.2)
+    return replace(samples, color=torch.from_numpy(np.uint8(samples.color.numpy() * passed[:, None] + 0.5)))
 
 
 def reordered(made):
