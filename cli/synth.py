@@ -12,8 +12,8 @@ from endotwin.effects import parse_states
 from endotwin.errors import OptionError
 from endotwin.output import DATASET, check_apart, check_free, check_picture
 
-LABELS = "rgb, rgb_linear, depth, normals, mask, albedo, roughness, metallic, diffuse, flow, flow_forward, "
-LABELS += "occlusion, triangles; 'all'"
+LABELS = "rgb, rgb_linear, rgb_exr, depth, depth_exr, normals, mask, albedo, roughness, metallic, diffuse, "
+LABELS += "flow, flow_forward, occlusion, triangles; 'all'"
 
 
 def synth(

@@ -20,20 +20,26 @@ from endotwin.twin import Twin
 
 
 class Illumination:
-    """The light of one twin; makes only what the twin's effects ask for."""
+    """The light of one twin; makes only what the twin's effects ask for.
 
-    def __init__(self, twin: Twin, caster: Caster):
+    Args:
+        before: that of another edit of the same twin; what the edits have in common is not made again. Form
+            factors are kept through edits that have no use for them.
+    """
+
+    def __init__(self, twin: Twin, caster: Caster, before: Illumination | None = None):
         self.twin = twin
         self._caster = caster
-        self._radiosity = self._albedo = None
+        self._radiosity = before._radiosity if before else None
+        self._albedo = None
         if "interreflection" in twin.effects:
-            surface, base_color = twin.surface, twin.materials.base_color
-            self._radiosity = Radiosity(surface, caster, twin.effects["interreflection"].cell_mm)
-            per_vertex = shading.specular_albedo(
-                torch.from_numpy(twin.materials.roughness), twin.materials.f0
-            )
-            answer = base_color + per_vertex.numpy()[:, None]
-            self._albedo = self._radiosity.mean(answer[surface.triangles].mean(axis=1))
+            cell_mm = twin.effects["interreflection"].cell_mm
+            if self._radiosity is None or self._radiosity.cell_mm != cell_mm:
+                self._radiosity = Radiosity(twin.surface, caster, cell_mm)
+            elif before.twin.materials is twin.materials:
+                self._albedo = before._albedo
+            if self._albedo is None:
+                self._albedo = self._radiosity.mean(_albedo_of_triangles(twin))
 
     @property
     def nbytes(self) -> int:
@@ -43,7 +49,7 @@ class Illumination:
     def at(self, T_world_camera: np.ndarray) -> ViewLight:
         """The light of the view from ``T_world_camera`` [4, 4]."""
         T_local_camera = self.twin.surface.to_local(T_world_camera)
-        irradiance = None if self._radiosity is None else self._bounced(T_local_camera)
+        irradiance = None if self._albedo is None else self._bounced(T_local_camera)
         return ViewLight(self.twin, self._caster, T_local_camera, irradiance)
 
     def _bounced(self, T_local_camera: np.ndarray) -> np.ndarray:
@@ -148,6 +154,15 @@ class ViewLight:
             coat = self.twin.effects["coat"]
             lobes.append((coat.weight * F0_WATER, torch.full_like(roughness, coat.roughness)))
         return lobes
+
+
+def _albedo_of_triangles(twin: Twin) -> np.ndarray:
+    """Share of light from all around that each triangle sends back, float32 [F, 3]."""
+    materials, triangles = twin.materials, twin.surface.triangles
+    glossy = shading.specular_albedo(torch.from_numpy(materials.roughness), materials.f0).numpy()
+    answer = materials.base_color * (1 - materials.metallic)[:, None] + glossy[:, None]
+    corners = [answer.take(triangles[:, k], axis=0) for k in range(3)]
+    return sum(corners) / np.float32(3)
 
 
 def _cos_o(hits: Correspondences, directions: np.ndarray, normals: np.ndarray) -> Tensor:

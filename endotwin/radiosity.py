@@ -59,11 +59,13 @@ class Radiosity:
     """Patches of one surface and the light between them.
 
     Attributes:
-        patch_of: int [F], patch of each triangle. centre_mm: float32 [P, 3], local frame.
+        cell_mm: size of the patches. patch_of: int [F], patch of each triangle.
+        centre_mm: float32 [P, 3], local frame.
         form_factors: CSR [P, P], rows sum to at most 1 (less where the tube is open).
     """
 
     def __init__(self, surface: Surface, caster: Caster, cell_mm: float, rays: int = RAYS, seed: int = 0):
+        self.cell_mm = cell_mm
         self._caster = caster
         self._lift_mm = LIFT * cell_mm
         generator = np.random.default_rng(seed)
@@ -81,7 +83,7 @@ class Radiosity:
         self._normals = normal[triangle]
         self.centre_mm = self._mean_of_points(self._points_mm)
         self._facing = unit(self._mean_of_points(self._normals))
-        self._surface, self._cell_mm = surface, cell_mm
+        self._surface = surface
 
     @cached_property
     def to_vertex(self) -> scipy.sparse.csr_array:
@@ -91,12 +93,12 @@ class Radiosity:
     def to_points(self, points_mm: np.ndarray, normals: np.ndarray) -> scipy.sparse.csr_array:
         """CSR [N, P], interpolation to ``points_mm`` [N, 3] with ``normals`` [N, 3]: Gaussian weights of
         the nearest patches that face alike."""
-        apart = FACING * self._cell_mm
+        apart = FACING * self.cell_mm
         tree = cKDTree(np.c_[self.centre_mm, apart * self._facing])
         neighbours = min(NEIGHBOURS, self.count)
         distance, nearest = tree.query(np.c_[points_mm, apart * normals], neighbours, workers=-1)
         distance, nearest = distance.reshape(-1, neighbours), nearest.reshape(-1, neighbours)
-        weight = np.exp((distance[:, :1] ** 2 - distance**2) / self._cell_mm**2).astype(np.float32)
+        weight = np.exp((distance[:, :1] ** 2 - distance**2) / self.cell_mm**2).astype(np.float32)
         weight /= weight.sum(axis=1, keepdims=True)
         pointers = np.arange(0, nearest.size + 1, neighbours)
         shape = (len(points_mm), self.count)

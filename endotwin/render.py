@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -104,9 +105,17 @@ class Renderer:
         self.caster = caster or Caster(twin.surface, threads)
         self._illumination = Illumination(twin, self.caster)
         self._exposure = np.asarray(exposure, np.float32)
-        materials = twin.materials
-        columns = [materials.base_color, materials.roughness[:, None], materials.metallic[:, None]]
-        self._normal_and_material = np.concatenate([twin.surface.normals, *columns], axis=1)
+        self._normal_and_material = _normal_and_material(twin)
+
+    def edited(self, twin: Twin, exposure: Sequence[float] | float = 1.0) -> Renderer:
+        """The renderer of another edit of the same twin; what the edits have in common is not made again."""
+        other = copy(self)
+        other.twin, other._exposure = twin, np.asarray(exposure, np.float32)
+        other._illumination = Illumination(twin, self.caster, before=self._illumination)
+        if twin.materials is not self.twin.materials:
+            other._normal_and_material = _normal_and_material(twin)
+        vars(other).pop("_transmission", None)
+        return other
 
     def view(self, T_world_camera: np.ndarray, mask: np.ndarray | None = None, exposure: float = 1.0) -> View:
         """The view from ``T_world_camera`` [4, 4], of the pixels in ``mask`` [H, W] if given.
@@ -181,6 +190,13 @@ class Renderer:
             hits, rays.pixel_directions, normals, torch.from_numpy(mixed[:, 3:])
         )
         return hits, normals, radiance.numpy(), visible
+
+
+def _normal_and_material(twin: Twin) -> np.ndarray:
+    """Normal, base colour, roughness and metallic of each vertex, float32 [V, 8]."""
+    materials = twin.materials
+    columns = [materials.base_color, materials.roughness[:, None], materials.metallic[:, None]]
+    return np.concatenate([twin.surface.normals, *columns], axis=1)
 
 
 def shadow_edges(visible: np.ndarray) -> np.ndarray:

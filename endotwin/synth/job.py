@@ -15,7 +15,7 @@ from endotwin.synth.trajectories import Trajectory
 from endotwin.synth.variation import Draw
 from endotwin.twin import Twin
 
-LIBRARIES = ("endotwin", "numpy", "torch", "embreex", "opencv-contrib-python-headless", "tifffile")
+LIBRARIES = ("endotwin", "numpy", "torch", "embreex", "opencv-contrib-python-headless", "openexr", "tifffile")
 
 THUMBNAILS = 24
 

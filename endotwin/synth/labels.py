@@ -23,7 +23,9 @@ HIDDEN_NONE, HIDDEN_NO, HIDDEN_YES = 128, 0, 255
 LABELS: dict[str, tuple[str, ...]] = {
     "rgb": ("rgb",),
     "rgb_linear": ("rgb_linear",),
+    "rgb_exr": ("rgb_exr",),
     "depth": ("depth",),
+    "depth_exr": ("depth_exr",),
     "normals": ("normals",),
     "mask": ("mask",),
     "albedo": ("albedo",),
@@ -38,6 +40,10 @@ LABELS: dict[str, tuple[str, ...]] = {
 """Labels that may be asked for, and the images that each one is written as."""
 
 DEFAULT_LABELS = ("rgb", "depth", "normals", "mask")
+
+PHOTOS = {"rgb", "rgb_linear", "rgb_exr"}
+SHADED = PHOTOS | {"diffuse", "albedo", "roughness", "metallic"}
+"""Labels that need a photo, and those that need the frame's draw at all."""
 
 SENSOR = 2
 """Stream of the random numbers of each frame's sensor."""
@@ -66,7 +72,7 @@ def triangle_kinds(surface: Surface) -> np.ndarray:
 
 
 class Labeller:
-    """Labels the frames of a job; keeps one ray caster, and one renderer for frames of the same draw."""
+    """Labels the frames of a job; keeps one ray caster, and the renderer of the latest draw."""
 
     def __init__(self, job: Job):
         self._job = job
@@ -81,15 +87,15 @@ class Labeller:
         T_world_camera = job.trajectory.T_world_camera[index]
         images, view = {}, None
         renderer = specular_free = None
-        if {"rgb", "rgb_linear", "diffuse", "albedo", "roughness", "metallic"} & set(job.labels):
+        if SHADED & set(job.labels):
             renderer, specular_free = self._renderers(index)
-        if {"rgb", "rgb_linear"} & set(job.labels):
+        if PHOTOS & set(job.labels):
             view = renderer.view(T_world_camera)
             generator = np.random.default_rng([job.document["seed"], SENSOR, index])
             color, radiance = photographed(
                 renderer, view, T_world_camera, self._T_world_next[index], generator
             )
-            images = {"rgb": color, "rgb_linear": radiance}
+            images = {"rgb": color, "rgb_linear": radiance, "rgb_exr": radiance}
         if specular_free is not None:
             matt = specular_free.view(T_world_camera)
             images["diffuse"], view = matt.color, view or matt
@@ -106,11 +112,15 @@ class Labeller:
         kept = self._shaded
         if kept is None or kept[0] != draw:
             twin, exposure = draw.edited(self._job.twin, self._job.regions)
-            share = {"camera": self._job.camera, "caster": self._caster, "exposure": exposure}
+            if kept is None:
+                renderer = Renderer(twin, self._job.camera, caster=self._caster, exposure=exposure)
+            else:
+                renderer = kept[1].edited(twin, exposure)
             specular_free = None
             if "diffuse" in self._job.labels:
-                specular_free = Renderer(replace(twin, materials=replace(twin.materials, f0=0.0)), **share)
-            kept = self._shaded = (draw, Renderer(twin, **share), specular_free)
+                matt = replace(twin.materials, f0=0.0)
+                specular_free = renderer.edited(replace(twin, materials=matt), exposure)
+            kept = self._shaded = (draw, renderer, specular_free)
         return kept[1:]
 
 
@@ -144,6 +154,10 @@ class _Geometry:
     def depth(self) -> np.ndarray:
         z = self._job.camera.pixel_directions.reshape(-1, 3)[:, 2].take(self._hits.pixel)
         return self._image(self._hits.distance_mm * z, np.nan)
+
+    @property
+    def depth_exr(self) -> np.ndarray:
+        return self.depth
 
     @property
     def normals(self) -> np.ndarray:

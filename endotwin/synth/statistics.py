@@ -89,7 +89,7 @@ class Statistics:
 
 def thumbnail(images: dict[str, np.ndarray]) -> bytes:
     """A small JPEG of the frame's colours or, without any, of another of its images."""
-    for name in ("rgb", "diffuse", "albedo", "rgb_linear"):
+    for name in ("rgb", "diffuse", "albedo", "rgb_linear", "rgb_exr"):
         if name in images:
             picture = encode_color(images[name])
             break
