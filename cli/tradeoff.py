@@ -28,8 +28,16 @@ def tradeoff(
         typer.Option(
             metavar="NAMES",
             help="Joined by commas: draft, standard, fine, a config file, a knob such as voxel=2, "
-            "several of them as draft+steps=0, or endopbr.",
+            "several of them as draft+steps=0, an effect as gain=on, or endopbr.",
             show_default="the whole ladder",
+        ),
+    ] = None,
+    effects: Annotated[
+        str | None,
+        typer.Option(
+            metavar="RUNG",
+            help="Also fit this rung with each effect forced on or off, against what the fit decides.",
+            show_default="no effects are compared",
         ),
     ] = None,
     repeats: Annotated[int, typer.Option(metavar="N", help="Runs of each rung; the median counts.")] = 3,
@@ -44,9 +52,10 @@ def tradeoff(
 
     Each rung is the commands fuse, fit and eval in processes of their own, from cold files. DIR gets
     tradeoff.csv, the plot tradeoff.png and .svg, and the page tradeoff.html with the command that
-    reproduces each rung. A run that was stopped goes on when the command is run again.
+    reproduces each rung. With --effects the page also shows what each effect gains and costs, and DIR gets
+    effects.csv, effects.png and .svg. A run that was stopped goes on when the command is run again.
 
-    Example: endotwin tradeoff examples/colon_small -o tradeoff --rungs draft,standard --repeats 1
+    Example: endotwin tradeoff examples/colon_small -o tradeoff --rungs draft --effects standard --repeats 1
     """
     check_free(output, overwrite, TRADEOFF)
     check_apart(output, [sequence])
@@ -55,9 +64,11 @@ def tradeoff(
     with console.command("tradeoff", profile) as run:
         with run.stage("import"):
             from endotwin.tradeoff import ladder, tradeoff
+            from endotwin.tradeoff.effects import base
             from endotwin.tradeoff.report import table
-        chosen = ladder(rungs, budget)
+        chosen, compared = ladder(rungs, budget), effects and base(effects)
         with run.stage("ladder"):
-            rows = tradeoff(sequence, output, chosen, repeats, geometry, overwrite, run.progress)
-    print(table(rows))
-    print(f"wrote {output}: tradeoff.html, tradeoff.png, tradeoff.svg and tradeoff.csv")
+            found = tradeoff(sequence, output, chosen, repeats, geometry, overwrite, run.progress, compared)
+    print(table(*found))
+    more = ", effects.csv, effects.png and effects.svg" if compared else ""
+    print(f"wrote {output}: tradeoff.html, tradeoff.png, tradeoff.svg, tradeoff.csv{more}")

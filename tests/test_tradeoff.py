@@ -16,9 +16,10 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
 from endotwin.config import Config, FitConfig, FuseConfig, load_config, preset_names
+from endotwin.effects import RENDERED
 from endotwin.errors import OptionError, OutputError
 from endotwin.readers import open_sequence
-from endotwin.tradeoff import LADDER, ladder, run, tradeoff
+from endotwin.tradeoff import LADDER, effects, ladder, run, tradeoff
 from endotwin.tradeoff.crops import telling_patch
 from endotwin.tradeoff.knee import knee, pareto_front
 from endotwin.tradeoff.measure import stages
@@ -88,9 +89,32 @@ def test_a_rung_is_a_preset_a_file_or_changes_of_one(tmp_path):
     assert endopbr.config.fit.method == "endopbr" and endopbr.config.fit.budget == 5
 
 
+def test_a_rung_may_force_effects_of_a_preset_a_file_or_turned_knobs(tmp_path):
+    mine = tmp_path / "mine.yaml"
+    mine.write_text("fit: {steps: 7}\neffects: {coat: on}")
+    preset, turned, file, many = ladder(
+        f"gain=on,voxel=2+gain=off,{mine}+gain=on,draft+coat=on+gain=off", "5s"
+    )
+    assert (preset.name, preset.given, preset.effects) == ("standard+gain=on", "standard", "gain=on")
+    assert preset.config == Config(effects={"gain": "on"})
+    assert preset.commands(Path("s"), "standard", "known")[1] == [
+        "fit",
+        "twin",
+        "--effects",
+        "gain=on",
+        "--seed",
+        "0",
+    ]
+    assert turned.config == Config(FuseConfig(voxel=2.0), effects={"gain": "off"}) and turned.given is None
+    assert (file.name, file.given) == ("mine+gain=on", str(mine))
+    assert file.config == Config(fit=FitConfig(steps=7), effects={"coat": "on", "gain": "on"})
+    assert many.effects == "coat=on,gain=off" and many.config.fit == load_config("draft").fit
+
+
 @pytest.mark.parametrize(
     ("names", "told"),
     [
+        ("gain=perhaps", "gain=perhaps"),
         ("gloss=2", "no knob"),
         ("quick", "there is no config 'quick'"),
         ("voxel=0", "rung 'voxel=0': fuse.voxel"),
@@ -143,7 +167,7 @@ class Interrupted(BaseException):
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory) -> tuple[Path, list[dict], int]:
-    """A ladder of two rungs, stopped in the second and run again: its folder, rows, count of measurements."""
+    """Two rungs and an effect, stopped in the second and run again: folder, rows, count of measurements."""
     work = tmp_path_factory.mktemp("tradeoff")
     tube = tube_sequence.write(work / "tube", frames=9)
     rungs, calls, measured = ladder("steps=0,voxel=3+steps=0", "1s"), [], run.measured
@@ -162,7 +186,8 @@ def made(tmp_path_factory) -> tuple[Path, list[dict], int]:
         assert stopped.value.__notes__ == [f"the same command goes on from {work / 'out.partial'}"]
         with pytest.raises(OutputError, match=r"out\.partial holds the results of another sequence"):
             tradeoff(tube, work / "out", rungs, repeats=1, geometry="heldout")
-        rows = tradeoff(tube, work / "out", rungs, repeats=1)
+        patch.setattr(effects, "FITTED", ("coat",))
+        rows, _ = tradeoff(tube, work / "out", rungs, repeats=1, base=effects.base("steps=0"))
     return work / "out", rows, len(calls)
 
 
@@ -171,7 +196,7 @@ def test_a_stopped_run_goes_on_where_it_was(made):
     assert calls == 3 and len(rows) == 2
     assert not out.with_name("out.partial").exists()
     assert {entry.name for entry in out.iterdir()} == {
-        "crops", "ladder.json", "results", "rungs",
+        "crops", "ladder.json", "results", "rungs", "effects", "effects.csv", "effects.png", "effects.svg",
         "tradeoff.csv", "tradeoff.html", "tradeoff.png", "tradeoff.svg",
     }  # fmt: skip
 
@@ -199,11 +224,27 @@ def test_the_command_of_a_rung_names_a_config_that_is_that_rung(made):
     assert out.name in " ".join(rows[0]["commands"][0])
 
 
+def test_each_effect_has_its_line_beside_the_fit_that_decided_it(made):
+    """One was forced on, in a tube that has none; what no fit needs is priced only."""
+    out, _, _ = made
+    assert {entry.name for entry in (out / "effects").iterdir()} == {"results", "rungs"}
+    with (out / "effects.csv").open(encoding="utf-8") as file:
+        written = {line["effect"]: line for line in csv.DictReader(file)}
+    assert set(written) == {effects.AS_DECIDED, "coat", *RENDERED}
+    plain, coat = written[effects.AS_DECIDED], written["coat"]
+    assert (coat["state"], coat["forced"]) == ("off", "on") and float(plain["frame_ms"]) > 0
+    assert float(coat["psnr"]) - float(plain["psnr"]) == pytest.approx(float(coat["psnr_gain"]), abs=1e-3)
+    assert "fit twin --config" in coat["commands"] and "--effects coat=on" in coat["commands"]
+    assert float(written["motion_blur"]["render_ms"]) > 0 and written["motion_blur"]["psnr"] == ""
+    page = (out / "tradeoff.html").read_text(encoding="utf-8")
+    assert all(f"<td>{effect}</td>" in page for effect in ("coat", *RENDERED))
+
+
 def test_the_page_stands_alone_and_tells_every_rung(made):
     out, rows, _ = made
     page = (out / "tradeoff.html").read_text(encoding="utf-8")
     sources = re.findall(r"(?:src|href)=[\"']([^\"']{5})", page)
-    assert len(sources) == 1 + 1 + len(rows) and set(sources) == {"data:"}
+    assert len(sources) == 2 + 1 + len(rows) and set(sources) == {"data:"}
     assert "<script" not in page and "@import" not in page
     for row in rows:
         assert row["rung"] in page and f"{row['psnr']:.2f}" in page
@@ -226,6 +267,8 @@ def test_the_results_tell_the_scores_that_eval_gave(made):
         (["--rungs", "gloss=2"], "no knob"),
         (["--repeats", "0"], "at least 1"),
         (["--budget", "soon", "--rungs", "endopbr"], "soon"),
+        (["--effects", "method=endopbr"], "fits no effects"),
+        (["--effects", "gloss=2"], "no knob"),
     ],
 )
 def test_a_mistake_is_one_line_and_leaves_nothing(made, tmp_path, monkeypatch, capsys, options, told):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -45,10 +46,15 @@ def priced(twin: Twin, caster: Caster) -> Twin:
 def _frame_ms(renderer: Renderer) -> float:
     """Best rendering of the sequence's middle frame."""
     pose = _middle_pose(renderer.twin)
+    return best_ms(lambda: renderer.view(pose))
+
+
+def best_ms(render: Callable[[], object]) -> float:
+    """Milliseconds of the fastest of some calls of ``render``."""
     times_s: list[float] = []
     while sum(times_s) < LEAST_S:
         began = time.perf_counter()
-        renderer.view(pose)
+        render()
         times_s.append(time.perf_counter() - began)
     return 1e3 * min(times_s)
 

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import shlex
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import dataclass, fields, is_dataclass, replace
 from pathlib import Path
 
 import yaml
 
 from endotwin.config import DEFAULT, SUFFIXES, Config, from_document, load_config, preset_names, to_yaml
+from endotwin.effects import NAMES, parse_states
 from endotwin.errors import OptionError
 
 LADDER = (
@@ -43,11 +44,13 @@ class Rung:
         name: a preset, a file's stem, or ``key=value`` changes of a preset joined by ``+``.
         config: what it means.
         given: what ``--config`` takes to get it, or None where it needs a file of its own.
+        effects: what ``--effects`` takes beside it.
     """
 
     name: str
     config: Config
     given: str | None
+    effects: str = ""
 
     @property
     def knob(self) -> str:
@@ -57,13 +60,21 @@ class Rung:
             return "endopbr" if self.config.fit.method == "endopbr" else changes[0].split("=")[0]
         return "preset" if self.name in preset_names() else "file"
 
+    def forcing(self, effect: str, state: str) -> Rung:
+        """This rung with one effect forced to ``state``."""
+        change = f"{effect}={state}"
+        config = replace(self.config, effects={**self.config.effects, effect: state})
+        effects = ",".join(filter(None, [self.effects, change]))
+        return Rung(f"{self.name}+{change}", config, self.given, effects)
+
     def commands(self, sequence: Path, config: str, geometry: str, seed: int = 0) -> list[list[str]]:
         """The arguments of fuse, fit and eval that make and score this rung's twin."""
         protocol = [] if geometry == "known" else ["--geometry", geometry]
         chosen = [] if config == DEFAULT else ["--config", config]
+        forced = ["--effects", self.effects] if self.effects else []
         return [
             ["fuse", str(sequence), "-o", "twin", *protocol, *chosen],
-            ["fit", "twin", *chosen, "--seed", str(seed)],
+            ["fit", "twin", *chosen, *forced, "--seed", str(seed)],
             ["eval", "twin", "--json", *([] if self.config.fuse.scale == 1 else ["--scale", "1"])],
         ]
 
@@ -71,6 +82,11 @@ class Rung:
 def shell(arguments: list[str]) -> str:
     """An endotwin command as one types it."""
     return shlex.join(["endotwin", *arguments])
+
+
+def one_line(commands: list[list[str]]) -> str:
+    """The commands of a rung as one line of shell."""
+    return " && ".join(shell(command) for command in commands)
 
 
 def ladder(names: str | None, endopbr_budget: str) -> list[Rung]:
@@ -90,21 +106,35 @@ def ladder(names: str | None, endopbr_budget: str) -> list[Rung]:
 
 
 def rung(name: str) -> Rung:
-    """The rung of that name: ``draft``, ``mine.yaml``, ``steps=1``, ``draft+voxel=2``."""
-    if Path(name).suffix in SUFFIXES:
-        return Rung(Path(name).stem, load_config(name), str(Path(name).resolve()))
-    first, *rest = name.split("+")
-    base, changes = (DEFAULT, [first, *rest]) if "=" in first else (first, rest)
-    if not changes:
-        return Rung(name, load_config(base), base)
+    """The rung of that name: ``draft``, ``mine.yaml``, ``steps=1``, ``draft+voxel=2+gain=on``."""
+    first, *rest = [name] if Path(name).suffix in SUFFIXES else name.split("+")
+    own = Path(first).suffix in SUFFIXES
+    base, changes = (DEFAULT, [first, *rest]) if "=" in first and not own else (first, rest)
+    effects = [change for change in changes if change.partition("=")[0] in NAMES]
+    knobs = [change for change in changes if change not in effects]
+    if knobs:
+        title = knobs if knobs[0] == first else [Path(base).stem if own else base, *knobs]
+        made = Rung("+".join(title), _turned(base, knobs, name), None)
+    elif own:
+        made = Rung(Path(base).stem, load_config(base), str(Path(base).resolve()))
+    else:
+        made = Rung(base, load_config(base), base)
+    for effect, state in parse_states(",".join(effects)).items():
+        made = made.forcing(effect, state)
+    return made
+
+
+def _turned(base: str, knobs: list[str], name: str) -> Config:
+    """The config ``base`` with ``knobs`` turned, for the rung ``name``."""
     document = yaml.safe_load(to_yaml(load_config(base)))
     parts = [part for part in fields(Config) if is_dataclass(part.default_factory)]
     homes = {key.name: part.name for part in parts for key in fields(part.default_factory)}
-    for change in changes:
-        key, _, value = change.partition("=")
+    for knob in knobs:
+        key, _, value = knob.partition("=")
         if key not in homes:
             raise OptionError(
-                f"rung '{name}' turns '{key}', which is no knob; the knobs are {', '.join(homes)}"
+                f"rung '{name}' turns '{key}', which is no knob; the knobs are {', '.join(homes)}, and the "
+                f"effects {', '.join(NAMES)}"
             )
         document[homes[key]][key] = yaml.safe_load(value)
-    return Rung(name, from_document(document, f"rung '{name}'"), None)
+    return from_document(document, f"rung '{name}'")

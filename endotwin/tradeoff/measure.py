@@ -53,21 +53,24 @@ def timed(arguments: list[str], files: Iterable[Path], work: Path) -> tuple[str,
 
 
 def measured(commands: list[list[str]], files: Sequence[Path], work: Path) -> dict:
-    """Fuse, fit and score one twin of the sequence with ``files``, in ``work``/twin, which is left there.
+    """Make and score one twin of the sequence with ``files``, in ``work``/twin, which is left there.
+
+    Args:
+        commands: those that make it, fuse and fit or fit alone; and the one that scores it.
 
     Returns:
-        ``{"seconds": of fuse and fit, "stages": {stage: s}, "peak_memory_mb", scores..., "load": before}``.
+        ``{"seconds": of making it, "stages": {stage: s}, "peak_memory_mb", scores..., "load": before}``.
     """
+    *making, scoring = commands
     shutil.rmtree(work / "twin", ignore_errors=True)
     load = os.getloadavg()[0] if hasattr(os, "getloadavg") else None
-    _, fuse = timed(commands[0], files, work)
-    _, fit = timed(commands[1], files, work)
-    printed, _ = timed(commands[2], files, work)
+    costs = [timed(command, files, work)[1] for command in making]
+    printed, _ = timed(scoring, files, work)
     scores = json.loads(printed)
     return {
-        "seconds": fuse["seconds"] + fit["seconds"],
-        "stages": stages(fuse, fit),
-        "peak_memory_mb": max(fuse["peak_memory_mb"], fit["peak_memory_mb"]),
+        "seconds": sum(cost["seconds"] for cost in costs),
+        "stages": stages(*costs),
+        "peak_memory_mb": max(cost["peak_memory_mb"] for cost in costs),
         **{name: scores[name] for name in SCORES},
         "load": load,
     }
@@ -97,6 +100,11 @@ STAGES = {
     "start": "closed form",
 }
 """Parts that go under another name in the plot."""
+
+
+def kept(path: Path, asked: dict) -> bool:
+    """Whether ``path`` holds what was measured for ``asked``."""
+    return path.exists() and json.loads(path.read_text()).items() >= asked.items()
 
 
 def keep(result: dict, path: Path) -> None:

@@ -11,9 +11,11 @@ matplotlib.use("Agg")
 import numpy as np
 from matplotlib import pyplot as plt
 from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.ticker import LogLocator, ScalarFormatter
+from matplotlib.ticker import FixedLocator, LogLocator, ScalarFormatter
 
+from endotwin.effects import FITTED
 from endotwin.tradeoff.knee import knee, pareto_front
 
 STYLE = {
@@ -49,6 +51,7 @@ STAGE_COLORS = {
     "train": "#9b7ebd",
     "bake": "#6a4c93",
 }
+LINEAR_DB, STEPS_DB = 0.1, (0.1, 0.3, 1, 3, 10, 30)
 OTHER_STAGES = ("#7fbf9b", "#4d9a72", "#2a6f4e")
 
 
@@ -70,9 +73,50 @@ def draw(rows: list[dict], files: list[Path]) -> None:
         bars = figure.add_subplot(grid[1, :])
         _bars(bars, rows, best)
         figure.legend(*bars.get_legend_handles_labels(), ncols=6, frameon=False, loc="outside lower center")
-        for file in files:
-            figure.savefig(file, dpi=160, metadata={"Date": None} if file.suffix == ".svg" else None)
-        plt.close(figure)
+        _save(figure, files)
+
+
+def draw_effects(rows: list[dict], files: list[Path]) -> None:
+    """Draw what each fitted effect of ``effects.rows`` gains against the seconds that it adds."""
+    tried = [row for row in rows if "psnr_gain" in row]
+    with plt.rc_context(STYLE):
+        figure, panels = plt.subplots(1, 2, figsize=(10, 3.6), layout="constrained")
+        for axes, score in zip(panels, ("psnr", "psnr_covered"), strict=True):
+            _gains(axes, tried, f"{score}_gain")
+            pixels = "covered pixels" if "covered" in score else "whole frame"
+            label = "PSNR with less without (dB)"
+            axes.set(xlabel="fit with less without (s)", ylabel=label, title=f"Gain, {pixels}")
+        keys = {"the fit called for it": "#444444", "forced on": "white"}
+        points = [
+            Line2D([], [], color="#444444", mfc=fill, marker="o", ls="", ms=5, label=key)
+            for key, fill in keys.items()
+        ]
+        figure.legend(handles=points, ncols=2, frameon=False, loc="outside lower center")
+        _save(figure, files)
+
+
+def _gains(axes: Axes, rows: list[dict], gain: str) -> None:
+    """One named point an effect, in a scale that is linear below LINEAR_DB and logarithmic above."""
+    seconds, gains = column(rows, "seconds_added"), column(rows, gain)
+    axes.axhline(0, color=FRONT_COLOR, lw=1, zorder=1)
+    axes.axvline(0, color=FRONT_COLOR, lw=1, zorder=1)
+    colors = [KNOB_COLORS[FITTED.index(row["effect"])] for row in rows]
+    for x, y, color, row in zip(seconds, gains, colors, rows, strict=True):
+        filled = {} if row["state"] == "on" else {"mfc": "white"}
+        axes.plot(x, y, "o", ms=6, color=color, zorder=3, **filled)
+    axes.margins(x=0.25, y=0.15)
+    axes.set_yscale("asinh", linear_width=LINEAR_DB)
+    axes.yaxis.set_major_locator(FixedLocator([0, *(sign * step for sign in (-1, 1) for step in STEPS_DB)]))
+    axes.yaxis.set_major_formatter("{x:+g}")
+    scaled, ends = np.arcsinh(gains / LINEAR_DB), np.arcsinh(np.array(axes.get_ylim()) / LINEAR_DB)
+    for index, height in _apart(seconds, scaled, 0.2 * np.ptp(axes.get_xlim()), 0.05 * np.ptp(ends)).items():
+        _name(axes, rows[index]["effect"], seconds[index], LINEAR_DB * np.sinh(height), colors[index])
+
+
+def _save(figure: Figure, files: list[Path]) -> None:
+    for file in files:
+        figure.savefig(file, dpi=160, metadata={"Date": None} if file.suffix == ".svg" else None)
+    plt.close(figure)
 
 
 def column(rows: list[dict], name: str) -> np.ndarray:
@@ -109,7 +153,14 @@ def _scatter(
     named = [
         index for index, row in enumerate(rows) if index in front or row["knob"] in ("preset", "endopbr")
     ]
-    _name(axes, rows, seconds, values, named, best)
+    log, line = np.log10(seconds[named]), 0.045 * (np.ptp(values) or 1.0)
+    for place, height in _apart(log, values[named], 0.35, line).items():
+        index = named[place]
+        text = rows[index]["rung"].replace("method=endopbr+budget=", "endopbr, ")
+        if index == best:
+            _name(axes, "knee: " + text, seconds[index], height, KNEE_COLOR)
+        else:
+            _name(axes, text, seconds[index], height)
     axes.set_xscale("log")
     axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
     axes.xaxis.set_major_formatter(ScalarFormatter())
@@ -121,29 +172,20 @@ def _scatter(
     axes.set(xlabel="fuse + fit (s, log scale)", ylabel=label, title=f"{label.split()[0]}, held-out photos")
 
 
-def _name(
-    axes: Axes, rows: list[dict], seconds: np.ndarray, values: np.ndarray, named: list[int], best: int | None
-) -> None:
-    """Write the rungs' names beside their points, those that would overlap one above the other."""
-    order = sorted(named, key=lambda index: -values[index])
-    span = np.ptp(values) or 1.0
-    placed: list[tuple[float, float]] = []
-    for index in order:
-        x, y = np.log10(seconds[index]), values[index]
-        at = y
-        while any(abs(x - px) < 0.35 and abs(at - py) < 0.045 * span for px, py in placed):
-            at -= 0.045 * span
-        placed.append((x, at))
-        text = "knee: " + rows[index]["rung"] if index == best else rows[index]["rung"]
-        axes.annotate(
-            text.replace("method=endopbr+budget=", "endopbr, "),
-            (seconds[index], at),
-            (9, 0),
-            textcoords="offset points",
-            fontsize=7.5,
-            va="center",
-            color=KNEE_COLOR if index == best else "#444444",
-        )
+def _apart(x: np.ndarray, y: np.ndarray, near: float, line: float) -> dict[int, float]:
+    """Heights for the names of points, by index: a line apart where the points are near in x."""
+    heights: dict[int, float] = {}
+    for index in np.argsort(-y):
+        height = y[index]
+        while any(abs(x[index] - x[at]) < near and abs(height - up) < line for at, up in heights.items()):
+            height -= line
+        heights[int(index)] = height
+    return heights
+
+
+def _name(axes: Axes, text: str, x: float, y: float, color: str = "#444444") -> None:
+    """Write the name of a point beside it."""
+    axes.annotate(text, (x, y), (9, 0), textcoords="offset points", fontsize=7.5, va="center", color=color)
 
 
 def _bars(axes: Axes, rows: list[dict], best: int | None) -> None:

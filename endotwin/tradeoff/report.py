@@ -7,8 +7,10 @@ import html
 import math
 from pathlib import Path
 
+from endotwin.tradeoff.by_effect import answer, section
+from endotwin.tradeoff.by_effect import table as effects_table
 from endotwin.tradeoff.knee import KNEE, knee, pareto_front
-from endotwin.tradeoff.ladder import shell
+from endotwin.tradeoff.ladder import one_line, shell
 from endotwin.tradeoff.plot import column
 
 CSS = """
@@ -30,6 +32,9 @@ th { font-weight: 600; text-align: right; border-bottom: 1.5px solid var(--ink);
 td { text-align: right; border-bottom: 1px solid var(--line); padding: .3rem .5rem; white-space: nowrap; }
 th:first-child, td:first-child { text-align: left; padding-left: 0; }
 td .range { color: var(--soft); font-size: 11px; }
+.effects :is(td, th):not(:first-child) { padding: .3rem .35rem; }
+.effects :is(td, th):last-child { text-align: left; white-space: normal; font-size: 11px; min-width: 9rem; }
+.effects .on td:first-child { font-weight: 600; }
 tr.front td:first-child { font-weight: 600; }
 tr.knee td { background: #fdf3f4; } tr.knee td:first-child { color: var(--accent); }
 .crops figure { display: inline-block; width: 8.7rem; margin: 0 .6rem .9rem 0; vertical-align: top; }
@@ -40,7 +45,7 @@ dl { margin: 0; } dt { font: 600 13px/1.4 system-ui, sans-serif; margin-top: .9r
 pre { margin: .2rem 0 0; padding: .5rem .7rem; background: #f7f7f8; border-radius: 4px; overflow-x: auto;
   font: 12px/1.5 ui-monospace, Menlo, Consolas, monospace; }
 footer { margin-top: 3rem; border-top: 1px solid var(--line); padding-top: .8rem; }
-@media print { body { max-width: none; padding: 0; } pre { white-space: pre-wrap; }
+@media print { body { max-width: none; padding: 0; } table { font-size: 10px; } pre { white-space: pre-wrap; }
   figure, dt { break-inside: avoid; } }
 """
 
@@ -67,16 +72,17 @@ a training photo saw.{busy}</p>
 <div class="crops">{crops}</div>
 <p class="note">{patch}: the patch of a held-out photo with the most lit detail, and what each twin shows
 there. No photo of this frame was fitted.</p>
+{effects}
 <h2>Commands</h2>
 <dl>{commands}</dl>
-<footer class="note">Made by <code>endotwin tradeoff</code>. The numbers are in tradeoff.csv, each run’s own
-in results/.</footer>
+<footer class="note">Made by <code>endotwin tradeoff</code>. The numbers are in tradeoff.csv (and
+effects.csv where effects were compared), each run’s own in results/.</footer>
 </body></html>
 """
 
 
-def table(rows: list[dict]) -> str:
-    """The rows as aligned text, fastest first, the front starred and the knee named; then the commands."""
+def table(rows: list[dict], by_effect: list[dict]) -> str:
+    """The rows as aligned text, fastest first, front starred and knee named; effects; commands."""
     seconds, psnr = column(rows, "seconds"), column(rows, "psnr")
     front, best = pareto_front(seconds, psnr), knee(seconds, psnr)
     lines = [["", "rung", "seconds", "PSNR", "SSIM", "PSNR covered", "peak memory"]]
@@ -93,19 +99,26 @@ def table(rows: list[dict]) -> str:
                 f"{row['peak_memory_mb'] / 1000:.2f} GB",
             ]
         )
+    effects = [*_aligned(effects_table(by_effect)), answer(by_effect), ""] if by_effect else []
+    commands = [f"{row['rung']}: {one_line(row['commands'])}" for row in _commanded(rows, by_effect)]
+    return "\n".join([*_aligned(lines), "* on the Pareto front", "", *effects, *commands])
+
+
+def _aligned(lines: list[list[str]]) -> list[str]:
+    """Cells as lines of text, in columns."""
     widths = [max(map(len, cells)) for cells in zip(*lines, strict=True)]
-    shown = ["  ".join(map(str.rjust, line, widths)) for line in lines]
-    commands = [f"{rows[index]['rung']}: {one_line(rows[index]['commands'])}" for index in seconds.argsort()]
-    return "\n".join([*shown, "* on the Pareto front", "", *commands])
+    return ["  ".join(map(str.rjust, line, widths)) for line in lines]
 
 
-def one_line(commands: list[list[str]]) -> str:
-    """The commands of a rung as one line of shell."""
-    return " && ".join(shell(command) for command in commands)
+def _commanded(rows: list[dict], by_effect: list[dict]) -> list[dict]:
+    """The rows with commands, each rung's once: the ladder's, fastest first, then the effects'."""
+    named = {row["rung"] for row in rows}
+    fitted = [row for row in by_effect if "commands" in row and row["rung"] not in named]
+    return [*sorted(rows, key=lambda row: row["seconds"]), *fitted]
 
 
-def write(rows: list[dict], facts: dict, work: Path) -> None:
-    """Write ``work``/tradeoff.html from the rows, the plot and the crops that lie in ``work``."""
+def write(rows: list[dict], by_effect: list[dict], facts: dict, work: Path) -> None:
+    """Write ``work``/tradeoff.html from the rows, the plots and the crops that lie in ``work``."""
     seconds, psnr = column(rows, "seconds"), column(rows, "psnr")
     front, best = pareto_front(seconds, psnr), knee(seconds, psnr)
     order = [int(index) for index in seconds.argsort()]
@@ -116,7 +129,7 @@ def write(rows: list[dict], facts: dict, work: Path) -> None:
     }[facts["geometry"]]
     title = f"What accuracy costs: {html.escape(facts['name'])}"
     runs = f"{facts['repeats']} runs each" if facts["repeats"] > 1 else "one run each"
-    loads = column(rows, "load")
+    loads = column(_commanded(rows, by_effect), "load")
     busy = (
         f" The load average before the runs was {loads.min():.1f} to {loads.max():.1f}."
         if loads.max() >= 0
@@ -135,7 +148,8 @@ def write(rows: list[dict], facts: dict, work: Path) -> None:
         busy=busy,
         crops=_crops(rows, order, best, work),
         patch=html.escape(facts["patch"]),
-        commands="".join(_commands(rows[index]) for index in order),
+        effects=section(by_effect, work),
+        commands="".join(map(_commands, _commanded(rows, by_effect))),
     )
     (work / "tradeoff.html").write_text(page, encoding="utf-8")
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 import os
 import platform
@@ -11,16 +10,15 @@ from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
 
-import numpy as np
-
 from endotwin.config import to_yaml
 from endotwin.errors import OutputError
 from endotwin.output import TRADEOFF, check_free
 from endotwin.readers import open_sequence
 from endotwin.sequence import Sequence
-from endotwin.tradeoff import crops, plot, report
+from endotwin.tradeoff import crops, effects, plot, report
 from endotwin.tradeoff.ladder import Rung
-from endotwin.tradeoff.measure import SCORES, keep, measured
+from endotwin.tradeoff.measure import keep, kept, measured
+from endotwin.tradeoff.summary import summary, write_csv
 from endotwin.twin import Source
 
 Progress = Callable[[str, int, int], None]
@@ -36,15 +34,19 @@ def tradeoff(
     geometry: str = "known",
     overwrite: bool = False,
     progress: Progress | None = None,
-) -> list[dict]:
+    base: Rung | None = None,
+) -> tuple[list[dict], list[dict]]:
     """Measure ``rungs`` on the sequence at ``path`` and write table, plot and page to the folder ``out``.
 
     Until all is measured the results lie in ``out.partial``; the same call goes on from there. Repeats go
     round the ladder, so that a machine that is busy for a while slows all rungs alike; each has a seed of its
     own.
 
+    Args:
+        base: the rung that is also fitted with each effect forced the other way; None: no such pages.
+
     Returns:
-        one row a rung, as ``summary`` makes them.
+        one row a rung, as ``summary`` makes them; one row an effect, as ``effects.rows`` does.
 
     Raises:
         SequenceError: no such sequence. OutputError: ``out`` is taken, or ``out.partial`` is another
@@ -62,12 +64,19 @@ def tradeoff(
             if progress:
                 progress(f"{rung.name}, run {repeat + 1} of {repeats}", done, len(runs))
             _measure(rung, repeat, sequence, geometry, work, patch)
+        cases = base and effects.measure(base, sequence, repeats, geometry, work / "effects", progress)
     except BaseException as stopped:
         stopped.add_note(f"the same command goes on from {work}")
         raise
     if progress:
         progress("report", len(runs), len(runs))
     rows = [summary(rung, repeats, work, out, path, geometry) for rung in rungs]
+    by_effect = []
+    if cases:
+        places = work / "effects", out / "effects"
+        by_effect = effects.rows(cases, repeats, *places, path, geometry)
+        write_csv(by_effect, work / "effects.csv")
+        plot.draw_effects(by_effect, [work / "effects.png", work / "effects.svg"])
     crops.save(crops.photo(sequence, patch), work / "crops" / "photo.png")
     size = f"{sequence.camera.width}×{sequence.camera.height}"
     facts = {
@@ -79,16 +88,17 @@ def tradeoff(
         "patch": f"frame {sequence.color_files[patch.frame].name}, {patch.size}×{patch.size} pixels "
         f"at column {patch.column}, row {patch.row}",
     }
-    _write_csv(rows, work / "tradeoff.csv")
+    write_csv(rows, work / "tradeoff.csv")
     plot.draw(rows, [work / "tradeoff.png", work / "tradeoff.svg"])
-    report.write(rows, facts, work)
-    for name in ("twin", "profile.json"):
-        entry = work / name
-        shutil.rmtree(entry) if entry.is_dir() else entry.unlink(missing_ok=True)
+    report.write(rows, by_effect, facts, work)
+    for place in (work, work / "effects"):
+        for name in ("twin", "fused", "fused.json", "profile.json"):
+            entry = place / name
+            shutil.rmtree(entry) if entry.is_dir() else entry.unlink(missing_ok=True)
     if out.exists():
         shutil.rmtree(out)
     work.rename(out)
-    return rows
+    return rows, by_effect
 
 
 def _enter(work: Path, asked: dict) -> None:
@@ -111,7 +121,7 @@ def _measure(
     """Measure one run of a rung and keep it, unless that was done; the first one's crop is kept too."""
     result = work / "results" / f"{rung.name}.{repeat}.json"
     asked = {"config": asdict(rung.config)}
-    if result.exists() and json.loads(result.read_text()).items() >= asked.items():
+    if kept(result, asked):
         return
     file = work / "rungs" / f"{rung.name}.yaml"
     file.write_text(to_yaml(rung.config))
@@ -122,30 +132,6 @@ def _measure(
     keep({**asked, **measurement}, result)
 
 
-def summary(rung: Rung, repeats: int, work: Path, out: Path, path: Path, geometry: str) -> dict:
-    """One rung's row: medians over the repeats, and the range of what varies.
-
-    Returns:
-        ``{"rung", "knob", "seconds", "seconds_min", "seconds_max", scores..., "psnr_min", "psnr_max",
-        "peak_memory_mb", "load", "stages": {name: s}, "commands": [str]}``; a score nobody measured is NaN.
-    """
-    runs = [
-        json.loads((work / "results" / f"{rung.name}.{repeat}.json").read_text()) for repeat in range(repeats)
-    ]
-    values = {
-        name: np.array([np.nan if run[name] is None else run[name] for run in runs], float)
-        for name in ("seconds", *SCORES, "peak_memory_mb", "load")
-    }
-    row = {"rung": rung.name, "knob": rung.knob, "repeats": repeats}
-    row |= {name: float(np.median(value)) for name, value in values.items()}
-    for name in ("seconds", "psnr", "ssim"):
-        row |= {f"{name}_min": float(values[name].min()), f"{name}_max": float(values[name].max())}
-    middle = runs[int(np.argsort(values["seconds"])[len(runs) // 2])]
-    config = rung.given or str(out / "rungs" / f"{rung.name}.yaml")
-    commands = rung.commands(path, config, geometry)
-    return {**row, "stages": middle["stages"], "commands": commands}
-
-
 def machine() -> str:
     """What it was measured on, in words."""
     model = platform.processor() or platform.machine()
@@ -154,16 +140,3 @@ def machine() -> str:
         lines = [line for line in info.read_text().splitlines() if line.startswith("model name")]
         model = lines[0].split(":", 1)[1].strip() if lines else model
     return f"{os.cpu_count()} cores, {model}, {platform.system()}"
-
-
-def _write_csv(rows: list[dict], path: Path) -> None:
-    """One line a rung; the stages' seconds in columns of their own."""
-    stages = list(dict.fromkeys(name for row in rows for name in row["stages"]))
-    plain = [name for name in rows[0] if name not in ("stages", "commands")]
-    with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file)
-        writer.writerow([*plain, *(f"{name} s" for name in stages), "commands"])
-        for row in rows:
-            values = [f"{row[name]:.6g}" if isinstance(row[name], float) else row[name] for name in plain]
-            shares = [f"{row['stages'].get(name, 0):.3f}" for name in stages]
-            writer.writerow([*values, *shares, report.one_line(row["commands"])])
