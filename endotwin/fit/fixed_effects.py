@@ -25,16 +25,21 @@ class Design:
         columns: float [N, C]. group: int [N] in 0 … count − 1, each with its own intercept.
         category: int [N], a second partition whose intercepts are wanted (the first is 0); None: there is
         none.
+        weight: [N], inverse variances up to one factor; None: all alike.
+        prior: precision [C, C] and pull [C] of the coefficients, beside values of variance 1 / weight; None:
+        nothing is known of them.
     """
 
     columns: np.ndarray
     group: np.ndarray
     count: int
     category: np.ndarray | None = None
+    weight: np.ndarray | None = None
+    prior: tuple[np.ndarray, np.ndarray] | None = None
 
     def __getitem__(self, rows: np.ndarray) -> Design:
-        category = None if self.category is None else self.category[rows]
-        return Design(self.columns[rows], self.group[rows], self.count, category)
+        category, weight = (None if x is None else x[rows] for x in (self.category, self.weight))
+        return Design(self.columns[rows], self.group[rows], self.count, category, weight, self.prior)
 
     def explained(self, found: FixedEffects) -> np.ndarray:
         """The values [N] without the groups' intercepts."""
@@ -60,19 +65,23 @@ def without_means(values: np.ndarray, weight: np.ndarray, group: np.ndarray, cou
 
 def regress(target: np.ndarray, design: Design, categories: int = 0, rounds: int = ROUNDS) -> FixedEffects:
     """Huber regression (iteratively reweighted) of ``target`` [N]; ``categories`` is their number."""
-    weight = np.ones(len(target))
-    group, count = design.group, design.count
+    trust = np.ones(len(target)) if design.weight is None else design.weight
+    weight, width = trust, 1.0
+    group, count, slopes = design.group, design.count, design.columns.shape[1]
     for _ in range(rounds):
         within = without_means(np.c_[design.columns, target], weight, group, count)
         normal, right = _normal_equations(within, weight, design, categories)
         normal[np.diag_indices_from(normal)] += RIDGE * np.trace(normal) + 1e-12
+        if design.prior is not None:
+            precision, pull = design.prior
+            normal[:slopes, :slopes] += width**2 * precision
+            right[:slopes] += width**2 * pull
         solved = np.linalg.solve(normal, right)
-        width_of = design.columns.shape[1]
-        found = FixedEffects(solved[:width_of], np.r_[0.0, solved[width_of:]], 0.0)
+        found = FixedEffects(solved[:slopes], np.r_[0.0, solved[slopes:]], 0.0)
         left = (target - design.explained(found))[:, None]
-        left = np.abs(without_means(left, weight, group, count)[:, 0])
+        left = np.abs(without_means(left, weight, group, count)[:, 0]) * np.sqrt(trust)
         width = max(1.4826 * float(np.median(left)), 1e-6) if len(left) else 1e-6
-        weight = np.minimum(1, HUBER * width / np.maximum(left, 1e-12))
+        weight = trust * np.minimum(1, HUBER * width / np.maximum(left, 1e-12))
     return FixedEffects(found.coefficients, found.intercepts, width)
 
 

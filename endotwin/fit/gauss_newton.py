@@ -153,7 +153,7 @@ class GaussNewton:
         self.samples, self.trial = samples, samples[self._trial_rows]
 
     def _global_prior(self, state: State) -> tuple[Tensor, Tensor]:
-        return _global_prior(self._unit_mm, len(state.shared.vector))
+        return global_prior(self._unit_mm, len(state.shared.vector))
 
     def noise(self, state: State) -> float:
         """Robust standard deviation of the residual, in display values."""
@@ -172,12 +172,13 @@ class GaussNewton:
         """One Gauss–Newton step with a backtracking line search; the state and by how much its cost fell (0:
         no step).
 
-        Light, response and f0 move only in a ``joint`` step, which costs six times as much.
+        Light, response and f0 move only in a ``joint`` step, which costs six times as much: interreflection
+        needs it, whose light depends on the albedo (see ``within`` for the others).
         """
         noise = self.noise(state)
         scale = 1 / (noise**2 * TEMPER)
         equations = assemble(
-            self.samples, self.pattern, self.triangles, state.materials, state.shared, HUBER * noise
+            self.samples, self.pattern, self.triangles, state.materials, state.shared, HUBER * noise, joint
         )
         table_step, shared_step = self._solve(state, equations, scale, joint)
         before = self.cost(state, noise)
@@ -185,7 +186,7 @@ class GaussNewton:
             moved = replace(
                 state,
                 table=state.table + length * table_step,
-                shared=_bounded(state.shared, state.shared.vector + length * shared_step),
+                shared=bounded(state.shared, state.shared.vector + length * shared_step),
             )
             after = self.cost(moved, noise)
             if after < before:
@@ -209,9 +210,9 @@ class GaussNewton:
             return back.reshape(rows, CHANNELS, columns) + self.precision[..., None] * x
 
         free = free_directions(state.shared, self.held) if joint else np.zeros((len(spread), 0))
-        right = torch.cat(
-            [equations.right[..., :1], equations.right[..., 1:] @ torch.from_numpy(free).float()], 2
-        )
+        right = equations.right
+        if joint:
+            right = torch.cat([right[..., :1], right[..., 1:] @ torch.from_numpy(free).float()], dim=2)
         right = (right * link * scale).reshape(len(link), -1)
         right = (self.operator.adjoint_csr @ right).reshape(len(state.table), CHANNELS, -1)
         right[..., 0] -= self.precision * state.table
@@ -232,17 +233,19 @@ class GaussNewton:
 
 
 def free_directions(shared: Globals, held: tuple[str, ...]) -> np.ndarray:
-    """Steps of the shared parameters that keep those named in ``held`` (L0, n, q, gamma, albedo scale): a
-    basis [G, K].
+    """Steps of the shared parameters that keep those named in ``held`` (L0, n, q, gamma, f0, albedo scale,
+    or the level γ·ln L0, with which displayed base colours stay): a basis [G, K].
 
     The light is fitted as γ·ln L0, γ·n and γ·q: γn − n·γ = 0 keeps n while γ moves.
     """
     log_L0, n, q = shared.log_light
     kept = {
         "L0": [1, 0, 0, -log_L0, 0, 0],
+        "level": [1, 0, 0, 0, 0, 0],
         "n": [0, 1, 0, -n, 0, 0],
         "q": [0, 0, 1, -q, 0, 0],
         "gamma": [0, 0, 0, 1, 0, 0],
+        "f0": [0, 0, 0, 0, 1, 0],
         "albedo scale": [0, 0, 0, 0, 0, 1],
     }
     count = len(shared.vector)
@@ -305,7 +308,7 @@ def conjugate_gradients(
     return x
 
 
-def _global_prior(unit_mm: float, count: int) -> tuple[Tensor, Tensor]:
+def global_prior(unit_mm: float, count: int) -> tuple[Tensor, Tensor]:
     """Mean and standard deviation of ``count`` shared parameters; L0 is the light at a distance of 1 mm,
     but its prior that at 1 unit."""
     mean, spread = (
@@ -321,7 +324,7 @@ def at_bounds(shared: Globals) -> list[str]:
     return [name for name, index in told.items() if float(shared.vector[index]) in GLOBAL_RANGE[index]]
 
 
-def _bounded(shared: Globals, vector: Tensor) -> Globals:
+def bounded(shared: Globals, vector: Tensor) -> Globals:
     limits = torch.tensor(GLOBAL_RANGE, dtype=torch.float64)[: len(vector)]
     return replace(shared, vector=torch.clamp(vector, limits[:, 0], limits[:, 1]))
 

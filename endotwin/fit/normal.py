@@ -131,9 +131,11 @@ def assemble(
     materials: Tensor,
     shared: Globals,
     width: float,
+    bordered: bool = True,
 ) -> NormalEquations:
-    """Linearise at vertex ``materials`` [V, 4] and ``shared``, and sum over the samples."""
-    count, globals_count = len(pattern.corners), len(shared.vector)
+    """Linearise at vertex ``materials`` [V, 4] and ``shared``, and sum over the samples; G is 0 unless
+    ``bordered``."""
+    count, globals_count = len(pattern.corners), len(shared.vector) if bordered else 0
     pair_sums = np.zeros((7, count, len(CORNER_PAIRS)), np.float32)
     corner_sums = np.zeros((count, 3, CHANNELS * (1 + globals_count)), np.float32)
     normal, right = np.zeros((globals_count,) * 2), np.zeros(globals_count)
@@ -150,7 +152,8 @@ def assemble(
         products.append((weighted_roughness * model.by_roughness).sum(dim=1))
         for k, product in enumerate(products):
             pair_sums[k][ids[starts]] += np.add.reduceat((pairs * product[:, None]).numpy(), starts, axis=0)
-        against = torch.cat([residual.error[..., None], model.by_globals], dim=2)
+        slopes = model.by_globals[..., :globals_count]
+        against = torch.cat([residual.error[..., None], slopes], dim=2)
         channels = torch.cat(
             [
                 weighted_color[..., None] * against,
@@ -161,7 +164,7 @@ def assemble(
         for corner in range(3):
             terms = (channels * part.barycentric[:, corner, None]).numpy()
             corner_sums[:, corner][ids[starts]] += np.add.reduceat(terms, starts, axis=0)
-        slopes = model.by_globals.flatten(0, 1)
+        slopes = slopes.flatten(0, 1)
         weighted = (slopes * residual.weight.reshape(-1, 1)).T
         normal += (weighted @ slopes).double().numpy()
         right += (weighted @ residual.error.reshape(-1)).double().numpy()

@@ -22,12 +22,13 @@ from endotwin.effects.price import priced
 from endotwin.errors import SequenceError
 from endotwin.fit.gauss_newton import ROUGHNESS_MEAN, GaussNewton, State, at_bounds, roughness_to_raw
 from endotwin.fit.lighting import Relighting, lit
-from endotwin.fit.model import Globals
+from endotwin.fit.model import Globals, at_pixels
 from endotwin.fit.pace import ITERATIONS, LIGHT, Pace
 from endotwin.fit.samples import THREADS, Samples, drawn, gather
 from endotwin.fit.start import ALBEDO_TOP, BRIGHT, Start, closed_form, start_at
 from endotwin.fit.tilt import tilted
 from endotwin.fit.unit import unit_mm
+from endotwin.fit.within import Within
 from endotwin.hashgrid import HashGrid, HashOperator
 from endotwin.shading import F0_DIELECTRIC
 from endotwin.surface import Surface
@@ -39,9 +40,10 @@ LIGHT_CELL_MM = 1.6
 LIGHT_COARSEST_MM = 12.0
 """Cells of the features beside which light and response are found, in units of the scene."""
 
-LIGHT_PIXELS, LIGHT_STEPS = 400_000, 4
+LIGHT_PIXELS, LIGHT_STEPS = 400_000, 6
 HOLD_STEPS, RELIGHT_STEPS = 1, 9
-"""Steps where the light depends on the materials and is renewed at each."""
+"""Steps where the light depends on the materials and is renewed at each; before HOLD_STEPS the albedo's
+scale is held."""
 
 LIGHT_SHARE = 0.25
 """Of fewer pixels than it takes to find LIGHT_PIXELS, this share."""
@@ -162,7 +164,6 @@ def _find_light(
         group[surface.triangles],
         operator,
         unit,
-        start.undetermined,
         out_of_time=pace.light_is_over,
     )
     shown = torch.from_numpy(start.base_color) ** start.response.gamma
@@ -176,15 +177,20 @@ def _find_light(
     ready = pace.stopwatch.total
     state, _ = solver.step(state, joint=False)
     step_s = pace.stopwatch.total - ready
+    bounce = "interreflection" in effects
     steps = RELIGHT_STEPS if relighting.needed else LIGHT_STEPS
     for number in range(steps):
         if pace.left(LIGHT) <= 2 * step_s:
             break
         relighting(solver, state)
-        solver.held = start.undetermined
-        if "interreflection" in effects:
-            solver.held += ("L0",) + ("albedo scale",) * (number < HOLD_STEPS)
-        state, gain = solver.step(state)
+        if bounce:
+            solver.held = (*start.undetermined, "L0", *(("albedo scale",) * (number < HOLD_STEPS)))
+        else:
+            within = Within.of(solver.samples, surface, unit)
+            material = at_pixels(solver.samples, solver.triangles, state.materials)
+            shared = within.renewed(material, state.shared, start.undetermined, solver.noise(state))
+            state = replace(state, shared=shared)
+        state, gain = solver.step(state, joint=bounce)
         pace.report("find the light", number + 1, steps)
         if gain < CONVERGED * solver.cost(state, solver.noise(state)):
             break

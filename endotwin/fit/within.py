@@ -1,0 +1,122 @@
+"""Light, response and f0 from what changes while one place of the tissue is looked at.
+
+Each vertex has an albedo that nobody knows. In log C that is an intercept of its own, and subtracting the
+vertex's mean takes it out exactly: what is left varies with distance, angle and frame only. Unlike a fit
+beside smooth albedo features, no texture can pass for shading, whatever those features cannot follow.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from endotwin import shading
+from endotwin.fit.fixed_effects import Design, regress
+from endotwin.fit.gauss_newton import TEMPER, bounded, free_directions, global_prior
+from endotwin.fit.model import Globals, linearise
+from endotwin.fit.samples import Samples
+from endotwin.fit.start import BRIGHT
+from endotwin.surface import Surface
+
+DIFFUSE_SIN2 = 0.15
+"""Farther than asin √0.15 ≈ 23° from the mirror direction a rough highlight has faded, too."""
+
+DARKEST = 0.03
+"""Display value of the prediction below which noise rules the logarithm."""
+
+MODEL_ERROR = 0.02
+"""Relative error of a prediction whose noise is 0: normals, albedo within a vertex's cell."""
+
+LEAST_SIGHTINGS = 16
+ROUNDS = 4
+
+
+@dataclass(frozen=True)
+class Sightings:
+    """What the pixels of a vertex in one photo tell together, S of them.
+
+    Attributes:
+        vertex: int [S]. residual: ln photo − ln prediction [S]. slopes: d ln C by the shared parameters [S,
+            G]. weight: inverse variance [S].
+    """
+
+    vertex: np.ndarray
+    residual: np.ndarray
+    slopes: np.ndarray
+    weight: np.ndarray
+
+
+@dataclass(frozen=True)
+class Within:
+    """Training pixels by the vertex that they are nearest to.
+
+    Attributes:
+        samples: N of them. vertex: int [N], below ``count``. unit_mm: the scene's unit of length.
+    """
+
+    samples: Samples
+    vertex: np.ndarray
+    count: int
+    unit_mm: float
+
+    @classmethod
+    def of(cls, samples: Samples, surface: Surface, unit_mm: float) -> Within:
+        corner = samples.barycentric.argmax(dim=1).numpy()
+        vertex = surface.triangles[samples.triangle.numpy(), corner]
+        return cls(samples, vertex, len(surface.vertices_mm), unit_mm)
+
+    def renewed(self, material: Tensor, shared: Globals, held: tuple[str, ...], noise: float) -> Globals:
+        """``shared`` after a Gauss–Newton step: light and response by what is off the highlights, then f0 by
+        all.
+
+        Args:
+            material: [N, 4] at the samples. held: which of n, q and gamma stay. noise: of a pixel, in display
+                values.
+        """
+        diffuse = self.samples.sin2 > DIFFUSE_SIN2
+        shared = self._step(material, shared, (*held, "level", "f0"), diffuse, noise)
+        if not shared.specular:
+            return shared
+        return self._step(material, shared, ("level", "n", "q", "gamma"), torch.ones_like(diffuse), noise)
+
+    def _step(
+        self, material: Tensor, shared: Globals, held: tuple[str, ...], chosen: Tensor, noise: float
+    ) -> Globals:
+        free = free_directions(shared, held)
+        seen = self.sightings(material, shared, chosen, noise)
+        if not free.shape[1] or len(seen.residual) < LEAST_SIGHTINGS:
+            return shared
+        mean, spread = (x.numpy() for x in global_prior(self.unit_mm, len(shared.vector)))
+        precision = free.T @ np.diag(TEMPER / spread**2) @ free
+        pull = free.T @ (TEMPER * (mean - shared.vector.numpy()) / spread**2)
+        columns = seen.slopes @ free
+        design = Design(columns, seen.vertex, self.count, weight=seen.weight, prior=(precision, pull))
+        along = free @ regress(seen.residual, design, rounds=ROUNDS).coefficients
+        length = min(1.0, float((spread / np.maximum(np.abs(along), 1e-12)).min()))
+        return bounded(shared, shared.vector + torch.from_numpy(length * along))
+
+    def sightings(self, material: Tensor, shared: Globals, chosen: Tensor, noise: float) -> Sightings:
+        """Sightings of the ``chosen`` samples (bool [N]) that are neither dark nor clipped.
+
+        What varies among the pixels of a sighting is where about the vertex they lie: texture, not light.
+        """
+        color = self.samples.color.double()
+        usable = chosen & (color.max(dim=1).values < BRIGHT) & (color.mean(dim=1) > 0)
+        rows = torch.nonzero(usable)[:, 0]
+        model = linearise(self.samples[rows], material[rows], shared)
+        floor = math.exp(shared.gamma * math.log(shading.RADIANCE_MIN))
+        predicted = model.predicted.double().mean(dim=1)
+        bright = predicted > DARKEST
+        rows, shown = rows[bright], (predicted[bright] + floor).numpy()
+        residual = np.log(color[rows].mean(dim=1).numpy() / 255 + floor) - np.log(shown)
+        slopes = model.by_globals[bright].double().mean(dim=1).numpy() / shown[:, None]
+        weight = 1 / ((noise / shown) ** 2 + MODEL_ERROR**2)
+        place = self.vertex[rows.numpy()].astype(np.int64) << 32 | self.samples.frame[rows].numpy()
+        place, which = np.unique(place, return_inverse=True)
+        total = np.bincount(which, weight, len(place))
+        means = [np.bincount(which, weight * column, len(place)) / total for column in (residual, *slopes.T)]
+        return Sightings(place >> 32, means[0], np.stack(means[1:], axis=1), total)
