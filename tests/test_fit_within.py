@@ -6,6 +6,9 @@ import numpy as np
 import pytest
 import torch
 
+from endotwin.effects import Decision
+from endotwin.effects.coat import Coat
+from endotwin.fit.film import judged
 from endotwin.fit.model import Globals, predict
 from endotwin.fit.samples import Samples
 from endotwin.fit.within import Within
@@ -17,8 +20,8 @@ ROUGHNESS = 0.45
 NOISE = 1 / 255
 
 
-def photographed(seed: int = 0) -> tuple[Within, torch.Tensor]:
-    """8-bit photos of vertices with random albedo, a fifth of them near the mirror direction; the materials."""
+def photographed(true: Globals = TRUE, seed: int = 0) -> tuple[Within, torch.Tensor]:
+    """8-bit photos of vertices with random albedo, a fifth near the mirror direction; and the materials."""
     generator = np.random.default_rng(seed)
     count = VERTICES * SIGHTINGS
     vertex = np.repeat(np.arange(VERTICES), SIGHTINGS)
@@ -38,7 +41,7 @@ def photographed(seed: int = 0) -> tuple[Within, torch.Tensor]:
         frame=torch.from_numpy(np.tile(np.arange(SIGHTINGS, dtype=np.int32), VERTICES)),
         pixel=torch.zeros(count, dtype=torch.int32),
     )
-    shown = predict(samples, material, TRUE).numpy() + generator.normal(0, NOISE, (count, 3))
+    shown = predict(samples, material, true).numpy() + generator.normal(0, NOISE, (count, 3))
     color = torch.from_numpy(np.uint8(np.clip(shown, 0, 1) * 255 + 0.5))
     return Within(replace(samples, color=color), vertex, VERTICES, 1.0), material
 
@@ -59,6 +62,25 @@ def test_light_response_and_f0_are_found_beside_an_albedo_that_is_nowhere_right(
     for _ in range(4):
         shared = within.renewed(material, shared, (), NOISE)
     assert told(shared) == pytest.approx(told(TRUE), rel=0.01)
+
+
+def test_a_coat_is_found_with_its_roughness_and_weight():
+    within, material = photographed(replace(TRUE, coat=Coat(0.8, 0.19)))
+    coat, decision = judged(within, material, TRUE, NOISE, "auto")
+    assert decision.state == "on" and coat.roughness == 0.19
+    shared = replace(TRUE, coat=coat)
+    for _ in range(6):
+        shared = within.renewed(material, shared, (), NOISE)
+    assert shared.coat.weight == pytest.approx(0.8, rel=0.05)
+    assert told(shared) == pytest.approx(told(TRUE), rel=0.02)
+
+
+def test_tissue_without_a_coat_gets_none_and_one_that_is_forced_on_weighs_nothing():
+    within, material = photographed()
+    assert judged(within, material, TRUE, NOISE, "auto")[0] is None
+    assert judged(within, material, TRUE, NOISE, "off") == (None, Decision("off", "forced off"))
+    forced, decision = judged(within, material, TRUE, NOISE, "on")
+    assert decision.state == "on" and forced.weight < 0.02
 
 
 def test_what_is_held_stays():

@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 
 from endotwin.casting import Caster
 from endotwin.effects import Decision, Effect, Effects
-from endotwin.effects.coat import Coat
 from endotwin.effects.gain import Gain
 from endotwin.effects.interreflection import Interreflection, bounced, cell_mm
 from endotwin.effects.offset import MOST_GUIDES, Offset, Search, shadow_columns
@@ -199,16 +198,10 @@ class _Trial:
         self._decide("shadows", "on" if shadows else "off", reason, shadow)
 
     def _decide_surface(self) -> None:
-        """What no probe of diffuse pixels could tell: the lobe is the published material's, a coat an
-        addition."""
+        """The published material's lobe, which no probe of diffuse pixels could tell."""
         on = self.wanted("specular") != "off"
         reason = "part of the published material; its strength f0 is fitted" if on else "forced off"
         self._decide("specular", "on" if on else "off", reason, None)
-        coat = self.wanted("coat") == "on"
-        reason = (
-            "forced on" if coat else "a film over tissue shows only where it is asked for: --effects coat=on"
-        )
-        self._decide("coat", "on" if coat else "off", reason, None)
 
     def _decide(self, name: str, state: str, reason: str, verdict: Verdict | None) -> None:
         gain_db = None if verdict is None else round(verdict.gain_db, 3)
@@ -231,8 +224,6 @@ class _Trial:
         if kept.hypothesis.vignetting:
             k2, k4 = kept.effects.coefficients[3:] / kept.gamma
             effects.append(Vignetting(float(k2), float(k4)))
-        if self.wanted("coat") == "on":
-            effects.append(Coat())
         return Effects(effects)
 
 

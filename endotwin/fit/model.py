@@ -9,12 +9,14 @@ and ρ the lobe's share of that; the photo shows C = x^γ
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from endotwin import shading
+from endotwin.effects.coat import F0_WATER, Coat
 from endotwin.fit.samples import Samples
 from endotwin.twin import Light, Response
 
@@ -29,11 +31,13 @@ BOUNCE_GLOBALS = (*GLOBALS, "ln albedo scale")
 class Globals:
     """What all pixels share, as one vector float64 [5] in the order of GLOBALS, or [6] of BOUNCE_GLOBALS.
 
-    Without ``specular`` there is no specular lobe, and ln f0 stays where it is.
+    Without ``specular`` there is no specular lobe, and ln f0 stays where it is. A ``coat`` adds a lobe of its
+    own.
     """
 
     vector: Tensor
     specular: bool = True
+    coat: Coat | None = None
 
     @classmethod
     def of(
@@ -75,11 +79,12 @@ def at_pixels(samples: Samples, triangles: Tensor, per_vertex: Tensor) -> Tensor
 
 @dataclass(frozen=True)
 class _Lit:
-    """What one guide does at N pixels: x = per_color·b + shine; each [N], like its ln of cone and
-    distance."""
+    """What one guide does at N pixels: x = per_color·b + shine + weight·film; each [N], like its ln of cone
+    and distance."""
 
     per_color: Tensor
     shine: Tensor | None
+    film: Tensor | None
     log_axis: Tensor
     log_distance: Tensor
 
@@ -92,11 +97,12 @@ def _guides(samples: Samples, roughness: Tensor, shared: Globals) -> list[_Lit]:
         strength = torch.exp(log_strength + exposure) * samples.cos * (2 * math.pi)
         one = torch.ones_like(samples.cos)
         per_color = strength * shading.burley(samples.cos, samples.cos, one, roughness) / math.pi
-        shine = None
-        if shared.specular:
-            lobe = shading.specular_colocated(samples.cos, samples.sin2, roughness)
-            shine = strength * shared.f0 * lobe
-        return [_Lit(per_color, shine, samples.log_cos_axis, samples.log_distance)]
+
+        def lobe(roughness: Tensor) -> Tensor:
+            return strength * shading.specular_colocated(samples.cos, samples.sin2, roughness)
+
+        shine, film = _lobes(lobe, roughness, shared)
+        return [_Lit(per_color, shine, film, samples.log_cos_axis, samples.log_distance)]
     guides, found = samples.guides, []
     count = guides.cos_i.shape[1]
     for k in range(count):
@@ -106,12 +112,23 @@ def _guides(samples: Samples, roughness: Tensor, shared: Globals) -> list[_Lit]:
         log_strength = shading.log_spotlight(*shared.log_light, log_axis, log_distance)
         strength = torch.exp(log_strength + exposure) * cos_i * (2 * math.pi / count)
         per_color = strength * shading.burley(cos_i, samples.cos, guides.cos_d[:, k], roughness) / math.pi
-        shine = None
-        if shared.specular:
-            lobe = shading.specular_lobe(cos_i, samples.cos, guides.sin2_m[:, k], roughness)
-            shine = strength * shared.f0 * lobe
-        found.append(_Lit(per_color, shine, log_axis, log_distance))
+
+        def lobe(roughness: Tensor, k=k, cos_i=cos_i, strength=strength) -> Tensor:
+            return strength * shading.specular_lobe(cos_i, samples.cos, guides.sin2_m[:, k], roughness)
+
+        shine, film = _lobes(lobe, roughness, shared)
+        found.append(_Lit(per_color, shine, film, log_axis, log_distance))
     return found
+
+
+def _lobes(
+    lobe: Callable[[Tensor], Tensor], roughness: Tensor, shared: Globals
+) -> tuple[Tensor | None, Tensor | None]:
+    """The tissue's highlight, and that of a coat of weight 1; None where there is none."""
+    shine = shared.f0 * lobe(roughness) if shared.specular else None
+    if shared.coat is None:
+        return shine, None
+    return shine, F0_WATER * lobe(torch.full_like(roughness, shared.coat.roughness).detach())
 
 
 def _bounced(samples: Samples, shared: Globals) -> Tensor:
@@ -129,6 +146,8 @@ def radiance(samples: Samples, material: Tensor, shared: Globals) -> Tensor:
     x = sum(guide.per_color for guide in lit)[:, None] * material[:, :3]
     if shared.specular:
         x = x + sum(guide.shine for guide in lit)[:, None]
+    if shared.coat is not None:
+        x = x + shared.coat.weight * sum(guide.film for guide in lit)[:, None]
     if samples.bounce is None:
         return x
     return x + _bounced(samples, shared) * (material[:, :3] + samples.bounce.gloss[:, None])
@@ -154,12 +173,14 @@ class Linearised:
     Attributes:
         predicted: [N, 3]. by_color: dC/db [N, 3] (each channel by its own base colour).
         by_roughness: dC/dr [N, 3]. by_globals: dC by the shared parameters, [N, 3, 5 or 6].
+        by_coat: dC by the coat's weight, [N, 3]; None: there is no coat.
     """
 
     predicted: Tensor
     by_color: Tensor
     by_roughness: Tensor
     by_globals: Tensor
+    by_coat: Tensor | None
 
 
 def linearise(samples: Samples, material: Tensor, shared: Globals) -> Linearised:
@@ -177,7 +198,10 @@ def linearise(samples: Samples, material: Tensor, shared: Globals) -> Linearised
             shine_slope = torch.autograd.grad(shine.sum(), roughness)[0]
     base_color, per_color, shine = material[:, :3].detach(), per_color.detach()[:, None], shine.detach()
     x = per_color * base_color + shine[:, None]
-    axis, distance = _moments(lit, base_color)
+    film = None if shared.coat is None else sum(guide.film for guide in lit).detach()[:, None]
+    if film is not None:
+        x = x + shared.coat.weight * film
+    axis, distance = _moments(lit, base_color, shared)
     if samples.bounce is not None:
         bounced = _bounced(samples, shared)
         glow = bounced * (base_color + samples.bounce.gloss[:, None])
@@ -202,15 +226,18 @@ def linearise(samples: Samples, material: Tensor, shared: Globals) -> Linearised
         by_color=by_color,
         by_roughness=slope * (color_slope[:, None] * base_color + shine_slope[:, None]),
         by_globals=torch.stack(by_globals, dim=-1),
+        by_coat=None if film is None else slope * film,
     )
 
 
-def _moments(lit: list[_Lit], base_color: Tensor) -> tuple[Tensor, Tensor]:
+def _moments(lit: list[_Lit], base_color: Tensor, shared: Globals) -> tuple[Tensor, Tensor]:
     """Σ_k x_k·(ln cone)_k and Σ_k x_k·(ln d)_k, [N, 3] each."""
     axis = distance = 0.0
     for guide in lit:
         x = guide.per_color.detach()[:, None] * base_color
         if guide.shine is not None:
             x = x + guide.shine.detach()[:, None]
+        if guide.film is not None:
+            x = x + shared.coat.weight * guide.film.detach()[:, None]
         axis, distance = axis + x * guide.log_axis[:, None], distance + x * guide.log_distance[:, None]
     return axis, distance

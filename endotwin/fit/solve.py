@@ -20,6 +20,7 @@ from endotwin.effects import Decision, Effects
 from endotwin.effects.decide import decide
 from endotwin.effects.price import priced
 from endotwin.errors import SequenceError
+from endotwin.fit.film import judged as judged_coat
 from endotwin.fit.gauss_newton import ROUGHNESS_MEAN, GaussNewton, State, at_bounds, roughness_to_raw
 from endotwin.fit.lighting import Relighting, lit
 from endotwin.fit.model import Globals, at_pixels
@@ -44,6 +45,9 @@ LIGHT_PIXELS, LIGHT_STEPS = 400_000, 6
 HOLD_STEPS, RELIGHT_STEPS = 1, 9
 """Steps where the light depends on the materials and is renewed at each; before HOLD_STEPS the albedo's
 scale is held."""
+
+COAT_STEP = 2
+"""A coat that nobody asked for is judged when light and materials are near."""
 
 LIGHT_SHARE = 0.25
 """Of fewer pixels than it takes to find LIGHT_PIXELS, this share."""
@@ -125,9 +129,10 @@ def fit_twin(twin: Twin, pace: Pace, seed: int, states: Mapping[str, str]) -> Tw
             )
         samples = lit(samples, twin, caster, decided.effects)
     with stopwatch.stage("light"):
+        wanted = states.get("coat", "auto") if "specular" in decided.effects else "off"
         count = min(LIGHT_PIXELS, int(LIGHT_SHARE * pace.start_pixels))
         rows = telling[torch.from_numpy(drawn(len(telling), count, np.random.default_rng(seed)))]
-        state, cost = _find_light(samples[rows], surface, start, pace, relighting)
+        state, cost, coat = _find_light(samples[rows], surface, start, pace, relighting, wanted)
     with stopwatch.stage("detail"):
         state, normals = _find_detail(samples, twin, state, cost, pace, relighting)
         twin = replace(twin, surface=replace(surface, normals=normals))
@@ -139,7 +144,8 @@ def fit_twin(twin: Twin, pace: Pace, seed: int, states: Mapping[str, str]) -> Tw
             *(" and ".join(stuck), twin.source.path),
         )
     with stopwatch.stage("price"):
-        fitted = priced(_fitted(twin, state, relighting.effects, decided.decisions), caster)
+        decisions = {**decided.decisions, "coat": coat}
+        fitted = priced(_fitted(twin, state, relighting.effects, decisions), caster)
     return fitted.with_record(
         fit={"method": "twin", "undetermined": list(start.undetermined), **stopwatch.to_dict()}
     )
@@ -152,9 +158,10 @@ def _telling(samples: Samples, surface: Surface) -> np.ndarray:
 
 
 def _find_light(
-    samples: Samples, surface: Surface, start: Start, pace: Pace, relighting: Relighting
-) -> tuple[State, _Cost]:
-    """Light, response, f0 and coarse materials; and what they cost."""
+    samples: Samples, surface: Surface, start: Start, pace: Pace, relighting: Relighting, coat: str
+) -> tuple[State, _Cost, Decision]:
+    """Light, response, f0 and coarse materials; what they cost; and whether there is a coat, which is auto,
+    on or off."""
     unit = unit_mm(surface)
     points, group = proxies(surface.vertices_mm, unit * LIGHT_CELL_MM / PROXIES)
     began = pace.stopwatch.total
@@ -177,24 +184,31 @@ def _find_light(
     ready = pace.stopwatch.total
     state, _ = solver.step(state, joint=False)
     step_s = pace.stopwatch.total - ready
-    bounce = "interreflection" in effects
-    steps = RELIGHT_STEPS if relighting.needed else LIGHT_STEPS
+    bounce, steps = "interreflection" in effects, RELIGHT_STEPS if relighting.needed else LIGHT_STEPS
+    judged = Decision("off", "no time to judge")
     for number in range(steps):
-        if pace.left(LIGHT) <= 2 * step_s:
+        late = pace.left(LIGHT) <= 2 * step_s
+        if late and (bounce or number):
             break
         relighting(solver, state)
+        within = Within.of(solver.samples, surface, unit)
+        material = at_pixels(solver.samples, solver.triangles, state.materials)
+        shared, noise = state.shared, solver.noise(state)
+        if number == (0 if coat == "on" else COAT_STEP):
+            layer, judged = judged_coat(within, material, shared, noise, coat)
+            shared = replace(shared, coat=layer)
         if bounce:
             solver.held = (*start.undetermined, "L0", *(("albedo scale",) * (number < HOLD_STEPS)))
         else:
-            within = Within.of(solver.samples, surface, unit)
-            material = at_pixels(solver.samples, solver.triangles, state.materials)
-            shared = within.renewed(material, state.shared, start.undetermined, solver.noise(state))
-            state = replace(state, shared=shared)
+            shared = within.renewed(material, shared, start.undetermined, noise)
+        state = replace(state, shared=shared)
+        if late:
+            break
         state, gain = solver.step(state, joint=bounce)
         pace.report("find the light", number + 1, steps)
         if gain < CONVERGED * solver.cost(state, solver.noise(state)):
             break
-    return state, _Cost(ready - began, step_s, len(points) * len(operator.cells_mm), len(samples))
+    return state, _Cost(ready - began, step_s, len(points) * len(operator.cells_mm), len(samples)), judged
 
 
 def _find_detail(
@@ -278,7 +292,9 @@ def _fitted(twin: Twin, state: State, effects: Effects, decisions: Mapping[str, 
     scale = float(ALBEDO_TOP / np.percentile(brightest, 98))
     if "interreflection" in effects:
         scale = math.exp(state.shared.log_scale)
-    light = state.shared.light
+    light, coat = state.shared.light, state.shared.coat
+    if coat is not None:
+        effects = effects.including(replace(coat, weight=coat.weight * scale))
     return replace(
         twin,
         materials=Materials(

@@ -8,9 +8,10 @@ beside smooth albedo features, no texture can pass for shading, whatever those f
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+import scipy.linalg
 import torch
 from torch import Tensor
 
@@ -31,6 +32,9 @@ DARKEST = 0.03
 MODEL_ERROR = 0.02
 """Relative error of a prediction whose noise is 0: normals, albedo within a vertex's cell."""
 
+COAT_SPREAD = 2.0
+"""Standard deviation of a coat's weight about 0: tissue is wet, not lacquered."""
+
 LEAST_SIGHTINGS = 16
 ROUNDS = 4
 
@@ -41,12 +45,13 @@ class Sightings:
 
     Attributes:
         vertex: int [S]. residual: ln photo − ln prediction [S]. slopes: d ln C by the shared parameters [S,
-            G]. weight: inverse variance [S].
+            G]. by_coat: d ln C by the coat's weight [S], 0 without one. weight: inverse variance [S].
     """
 
     vertex: np.ndarray
     residual: np.ndarray
     slopes: np.ndarray
+    by_coat: np.ndarray
     weight: np.ndarray
 
 
@@ -70,8 +75,8 @@ class Within:
         return cls(samples, vertex, len(surface.vertices_mm), unit_mm)
 
     def renewed(self, material: Tensor, shared: Globals, held: tuple[str, ...], noise: float) -> Globals:
-        """``shared`` after a Gauss–Newton step: light and response by what is off the highlights, then f0 by
-        all.
+        """``shared`` after a Gauss–Newton step: light and response by what is off the highlights, then f0 and
+        the coat by all.
 
         Args:
             material: [N, 4] at the samples. held: which of n, q and gamma stay. noise: of a pixel, in display
@@ -86,6 +91,7 @@ class Within:
     def _step(
         self, material: Tensor, shared: Globals, held: tuple[str, ...], chosen: Tensor, noise: float
     ) -> Globals:
+        coated = "f0" not in held and shared.coat is not None
         free = free_directions(shared, held)
         seen = self.sightings(material, shared, chosen, noise)
         if not free.shape[1] or len(seen.residual) < LEAST_SIGHTINGS:
@@ -94,9 +100,17 @@ class Within:
         precision = free.T @ np.diag(TEMPER / spread**2) @ free
         pull = free.T @ (TEMPER * (mean - shared.vector.numpy()) / spread**2)
         columns = seen.slopes @ free
+        if coated:
+            columns = np.c_[columns, seen.by_coat]
+            precision = scipy.linalg.block_diag(precision, TEMPER / COAT_SPREAD**2)
+            pull = np.r_[pull, -TEMPER * shared.coat.weight / COAT_SPREAD**2]
         design = Design(columns, seen.vertex, self.count, weight=seen.weight, prior=(precision, pull))
-        along = free @ regress(seen.residual, design, rounds=ROUNDS).coefficients
+        found = regress(seen.residual, design, rounds=ROUNDS).coefficients
+        along = free @ found[: free.shape[1]]
         length = min(1.0, float((spread / np.maximum(np.abs(along), 1e-12)).min()))
+        if coated:
+            weight = max(0.0, shared.coat.weight + length * float(found[-1]))
+            shared = replace(shared, coat=replace(shared.coat, weight=weight))
         return bounded(shared, shared.vector + torch.from_numpy(length * along))
 
     def sightings(self, material: Tensor, shared: Globals, chosen: Tensor, noise: float) -> Sightings:
@@ -114,9 +128,13 @@ class Within:
         rows, shown = rows[bright], (predicted[bright] + floor).numpy()
         residual = np.log(color[rows].mean(dim=1).numpy() / 255 + floor) - np.log(shown)
         slopes = model.by_globals[bright].double().mean(dim=1).numpy() / shown[:, None]
+        by_coat = np.zeros(len(shown))
+        if model.by_coat is not None:
+            by_coat = model.by_coat[bright].double().mean(dim=1).numpy() / shown
         weight = 1 / ((noise / shown) ** 2 + MODEL_ERROR**2)
         place = self.vertex[rows.numpy()].astype(np.int64) << 32 | self.samples.frame[rows].numpy()
         place, which = np.unique(place, return_inverse=True)
         total = np.bincount(which, weight, len(place))
-        means = [np.bincount(which, weight * column, len(place)) / total for column in (residual, *slopes.T)]
-        return Sightings(place >> 32, means[0], np.stack(means[1:], axis=1), total)
+        averaged = (residual, by_coat, *slopes.T)
+        means = [np.bincount(which, weight * column, len(place)) / total for column in averaged]
+        return Sightings(place >> 32, means[0], np.stack(means[2:], axis=1), means[1], total)

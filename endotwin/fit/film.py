@@ -1,0 +1,75 @@
+"""Whether the tissue wears a wet film: what its highlights show beside the lobe of the tissue itself."""
+
+from __future__ import annotations
+
+import math
+import time
+from dataclasses import replace
+
+import numpy as np
+from torch import Tensor
+
+from endotwin.effects import Decision
+from endotwin.effects.coat import Coat
+from endotwin.effects.probe import Verdict
+from endotwin.fit.fixed_effects import Design, regress, robust_losses
+from endotwin.fit.model import GLOBALS, Globals
+from endotwin.fit.within import DIFFUSE_SIN2, LEAST_SIGHTINGS, Within
+
+ROUGHNESSES = (0.06, 0.09, 0.13, 0.19, 0.27)
+F0 = GLOBALS.index("ln f0")
+
+
+def judged(
+    within: Within, material: Tensor, shared: Globals, noise: float, wanted: str
+) -> tuple[Coat | None, Decision]:
+    """The coat that the highlights call for, or that is ``wanted`` (auto, on or off); and why."""
+    if wanted == "off":
+        return None, Decision("off", "forced off")
+    began = time.perf_counter()
+    coat, verdict = film(within, material, shared, noise)
+    took_s = round(time.perf_counter() - began, 3)
+    forced = "forced on; " if wanted == "on" else ""
+    if wanted == "auto" and not verdict.keep:
+        reason = f"does not predict held-out highlights better ({verdict})"
+        return None, Decision("off", reason, round(verdict.gain_db, 3), took_s)
+    reason = f"{forced}predicts held-out highlights better by {verdict}"
+    return coat, Decision("on", reason, round(verdict.gain_db, 3), took_s)
+
+
+def film(within: Within, material: Tensor, shared: Globals, noise: float) -> tuple[Coat, Verdict]:
+    """The coat that predicts highlights best, and by how much better than none it does on vertices that did
+    not choose its weight.
+
+    Args:
+        material: [N, 4] at the samples. noise: of a pixel, in display values.
+    """
+    shiny = within.samples.sin2 < DIFFUSE_SIN2
+    best = Coat(0.0, ROUGHNESSES[0]), Verdict(0.0, 0.0)
+    for roughness in ROUGHNESSES:
+        trial = replace(shared, coat=Coat(0.0, roughness))
+        seen = within.sightings(material, trial, shiny, noise)
+        if len(seen.residual) < LEAST_SIGHTINGS:
+            return best
+        with_coat = Design(np.c_[seen.slopes[:, F0], seen.by_coat], seen.vertex, within.count)
+        without = replace(with_coat, columns=with_coat.columns[:, :1])
+        weight = float(regress(seen.residual, with_coat).coefficients[1])
+        verdict = _compared(seen.residual, without, with_coat)
+        if weight > 0 and verdict.gain_db > best[1].gain_db:
+            best = Coat(weight, roughness), verdict
+    return best
+
+
+def _compared(target: np.ndarray, without: Design, with_coat: Design) -> Verdict:
+    """How much better the second design predicts the vertices of one half from the other."""
+    half = (np.random.default_rng(0).random(without.count) < 0.5)[without.group]
+    width = regress(target, without).width
+    before, after = np.zeros(len(target)), np.zeros(len(target))
+    for losses, design in ((before, without), (after, with_coat)):
+        for part in (half, ~half):
+            found = regress(target[part], design[part])
+            losses[~part] = robust_losses(target[~part], design[~part], found, width)
+    gained = np.bincount(without.group, before - after, without.count)
+    sigma = max(math.sqrt(float((gained**2).sum())), 1e-30)
+    ratio = before.sum() / max(float(after.sum()), 1e-30)
+    return Verdict(10 * math.log10(max(ratio, 1e-30)), float(gained.sum()) / sigma)
