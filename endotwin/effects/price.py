@@ -31,10 +31,10 @@ def priced(twin: Twin, caster: Caster) -> Twin:
     if dear:
         whole = Renderer(twin, caster=caster)
         whole.view(_middle_pose(twin))
-        whole_ms = _frame_ms(whole)
+        whole_ms = frame_ms(whole)
         for name in dear:
             gone = {"offset": ("offset", "shadows")}.get(name, (name,))
-            other_ms = _frame_ms(Renderer(replace(twin, effects=twin.effects.without(gone)), caster=caster))
+            other_ms = frame_ms(whole.edited(replace(twin, effects=twin.effects.without(gone))))
             decisions[name] = replace(
                 decisions[name],
                 render_ms=round(max(0.0, whole_ms - other_ms), 1),
@@ -43,8 +43,8 @@ def priced(twin: Twin, caster: Caster) -> Twin:
     return replace(twin, decisions=decisions)
 
 
-def _frame_ms(renderer: Renderer) -> float:
-    """Best rendering of the sequence's middle frame."""
+def frame_ms(renderer: Renderer) -> float:
+    """Milliseconds of the sequence's middle frame."""
     pose = _middle_pose(renderer.twin)
     return best_ms(lambda: renderer.view(pose))
 

@@ -36,8 +36,8 @@ DARKEST = -20.0
 MIN_GAIN_DB = 0.2
 MIN_SIGMAS = 4.0
 """An effect is kept where it lowers the held-out error by so much, and by so many of its own
-uncertainties. On a scene that has none of the effects, none gains 0.04 dB; on one that has it, each gains
-more than 1 dB."""
+uncertainties. Of the scenes that were tried, those without an effect show at most 0.19 dB of it, 0.04 dB
+where no light is bounced; those that have it at least 0.57 dB."""
 
 HINT_DB, HINT_SIGMAS = 0.1, 2.0
 """What is worth a longer look, which then has to be worth keeping."""
@@ -223,21 +223,11 @@ class Probe:
 
     def compare(self, base: Fitted, other: Fitted) -> Verdict:
         """How much better ``other`` predicts pixels of vertices that did not choose its coefficients."""
-        before, after = (self._held_out(model, base.effects.width) for model in (base, other))
-        gained = np.bincount(self.vertex, before - after, self.count)
-        sigma = max(math.sqrt(float((gained**2).sum())), 1e-30)
-        ratio = before.sum() / max(float(after.sum()), 1e-30)
-        return Verdict(10 * math.log10(max(ratio, 1e-30)), float(gained.sum()) / sigma)
+        designs = base.design, other.design
+        return compared(self.target, *designs, self._half, base.effects.width, len(self.frames))
 
     def _fitted(self, hypothesis: Hypothesis, design: Design) -> Fitted:
         return Fitted(hypothesis, design, regress(self.target, design, len(self.frames)))
-
-    def _held_out(self, model: Fitted, width: float) -> np.ndarray:
-        losses = np.zeros(len(self))
-        for half in (self._half, ~self._half):
-            found = regress(self.target[half], model.design[half], len(self.frames))
-            losses[~half] = robust_losses(self.target[~half], model.design[~half], found, width)
-        return losses
 
     def _design(self, hypothesis: Hypothesis, columns: np.ndarray) -> Design:
         if hypothesis.vignetting:
@@ -272,6 +262,32 @@ class Probe:
 
         r2 = squared_radius(self.twin.camera, self.samples.pixel.numpy())
         return np.c_[r2, r2 * r2]
+
+
+def compared(
+    target: np.ndarray, base: Design, other: Design, half: np.ndarray, width: float, categories: int = 0
+) -> Verdict:
+    """How much better ``other`` explains values of groups that did not choose its coefficients.
+
+    Args:
+        target: [N]. half: bool [N], of whole groups: each half chooses for the other. width: of the loss.
+        categories: number of the designs' categories.
+    """
+    before, after = (_held_out(target, design, half, width, categories) for design in (base, other))
+    gained = np.bincount(base.group, before - after, base.count)
+    sigma = max(math.sqrt(float((gained**2).sum())), 1e-30)
+    ratio = before.sum() / max(float(after.sum()), 1e-30)
+    return Verdict(10 * math.log10(max(ratio, 1e-30)), float(gained.sum()) / sigma)
+
+
+def _held_out(
+    target: np.ndarray, design: Design, half: np.ndarray, width: float, categories: int
+) -> np.ndarray:
+    losses = np.zeros(len(target))
+    for part in (half, ~half):
+        found = regress(target[part], design[part], categories)
+        losses[~part] = robust_losses(target[~part], design[~part], found, width)
+    return losses
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import time
 from dataclasses import replace
 
@@ -12,8 +11,8 @@ from torch import Tensor
 
 from endotwin.effects import Decision
 from endotwin.effects.coat import Coat
-from endotwin.effects.probe import Verdict
-from endotwin.fit.fixed_effects import Design, regress, robust_losses
+from endotwin.effects.probe import Verdict, compared
+from endotwin.fit.fixed_effects import Design, regress
 from endotwin.fit.model import GLOBALS, Globals
 from endotwin.fit.within import DIFFUSE_SIN2, LEAST_SIGHTINGS, Within
 
@@ -59,22 +58,9 @@ def film(within: Within, material: Tensor, shared: Globals, noise: float) -> tup
         with_coat = Design(np.c_[seen.slopes[:, F0], seen.by_coat], seen.vertex, within.count)
         without = replace(with_coat, columns=with_coat.columns[:, :1])
         weight = float(regress(seen.residual, with_coat).coefficients[1])
-        verdict = _compared(seen.residual, without, with_coat)
+        half = (np.random.default_rng(0).random(within.count) < 0.5)[seen.vertex]
+        width = regress(seen.residual, without).width
+        verdict = compared(seen.residual, without, with_coat, half, width)
         if weight > 0 and verdict.gain_db > best[1].gain_db:
             best = Coat(weight, roughness), verdict
     return best
-
-
-def _compared(target: np.ndarray, without: Design, with_coat: Design) -> Verdict:
-    """How much better the second design predicts the vertices of one half from the other."""
-    half = (np.random.default_rng(0).random(without.count) < 0.5)[without.group]
-    width = regress(target, without).width
-    before, after = np.zeros(len(target)), np.zeros(len(target))
-    for losses, design in ((before, without), (after, with_coat)):
-        for part in (half, ~half):
-            found = regress(target[part], design[part])
-            losses[~part] = robust_losses(target[~part], design[~part], found, width)
-    gained = np.bincount(without.group, before - after, without.count)
-    sigma = max(math.sqrt(float((gained**2).sum())), 1e-30)
-    ratio = before.sum() / max(float(after.sum()), 1e-30)
-    return Verdict(10 * math.log10(max(ratio, 1e-30)), float(gained.sum()) / sigma)

@@ -131,7 +131,6 @@ class GaussNewton:
         triangles: np.ndarray,
         operator: HashOperator,
         unit_mm: float = 1.0,
-        held: tuple[str, ...] = (),
         seed: int = 0,
         out_of_time: Callable[[], bool] = lambda: False,
     ):
@@ -141,7 +140,7 @@ class GaussNewton:
         self.operator = operator
         self.precision = prior_precision(operator, unit_mm)
         self._unit_mm = unit_mm
-        self.held = held
+        self.held: tuple[str, ...] = ()
         self.out_of_time = out_of_time
         chosen = drawn(len(samples), SEARCH_SAMPLES, np.random.default_rng(seed))
         self._trial_rows = torch.from_numpy(chosen)

@@ -12,10 +12,9 @@ from pathlib import Path
 import numpy as np
 
 from endotwin.casting import Caster
-from endotwin.config import to_yaml
 from endotwin.effects import FITTED, RENDERED, Decision
 from endotwin.effects.exposure import following
-from endotwin.effects.price import best_ms
+from endotwin.effects.price import best_ms, frame_ms
 from endotwin.errors import OptionError
 from endotwin.output import TWIN
 from endotwin.render import Renderer
@@ -23,7 +22,7 @@ from endotwin.sequence import Sequence
 from endotwin.synth.photograph import photographed
 from endotwin.synth.switches import equipped
 from endotwin.tradeoff.ladder import Rung, rung
-from endotwin.tradeoff.measure import keep, kept, measured, timed
+from endotwin.tradeoff.measure import due, keep, kept, measured, timed
 from endotwin.tradeoff.summary import summary
 from endotwin.twin import Twin
 
@@ -107,14 +106,10 @@ def _measure(
     case: Rung, repeat: int, sequence: Sequence, geometry: str, work: Path, rendered_too: bool
 ) -> None:
     """Measure one fit and keep it, unless that was done; ``rendered_too``: price what no fit needs."""
-    result = work / "results" / f"{case.name}.{repeat}.json"
-    asked = {"config": asdict(case.config)}
-    if kept(result, asked):
+    if (run := due(case, repeat, work)) is None:
         return
-    file = work / "rungs" / f"{case.name}.yaml"
-    file.write_text(to_yaml(case.config))
-    files = [*sequence.color_files, *sequence.depth_files]
-    config, whole = case.given or str(file.resolve()), work.resolve()
+    result, asked, config = run
+    files, whole = [*sequence.color_files, *sequence.depth_files], work.resolve()
     fuse, fit, score = case.commands(sequence.path.resolve(), config, geometry, repeat)
     fused = {"fuse": asdict(case.config.fuse)}
     if not (kept(work / "fused.json", fused) and (work / "fused" / TWIN).exists()):
@@ -127,13 +122,7 @@ def _measure(
     if rendered_too:
         for name, milliseconds in rendered_ms(twin).items():
             found[name]["render_ms"] = milliseconds
-    keep({**asked, **measurement, "effects": found, "frame_ms": frame_ms(twin)}, result)
-
-
-def frame_ms(twin: Twin) -> float:
-    """Milliseconds of a frame in the middle of the twin's sequence."""
-    renderer, poses = Renderer(twin), twin.sequence().T_world_camera
-    return best_ms(lambda: renderer.view(poses[len(poses) // 2]))
+    keep({**asked, **measurement, "effects": found, "frame_ms": frame_ms(Renderer(twin))}, result)
 
 
 def rendered_ms(twin: Twin) -> dict[str, float]:

@@ -9,10 +9,13 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterable, Sequence
+from dataclasses import asdict
 from pathlib import Path
 
+from endotwin.config import to_yaml
 from endotwin.errors import EndotwinError
 from endotwin.output import whole_file
+from endotwin.tradeoff.ladder import Rung
 
 SCORES = ("psnr", "ssim", "lpips", "psnr_covered", "covered")
 
@@ -100,6 +103,17 @@ STAGES = {
     "start": "closed form",
 }
 """Parts that go under another name in the plot."""
+
+
+def due(rung: Rung, repeat: int, work: Path) -> tuple[Path, dict, str] | None:
+    """A run that is still to be measured: where its result goes, what was asked, and its config as commands
+    name it, written below ``work``; None: it is there."""
+    result, asked = work / "results" / f"{rung.name}.{repeat}.json", {"config": asdict(rung.config)}
+    if kept(result, asked):
+        return None
+    file = work / "rungs" / f"{rung.name}.yaml"
+    file.write_text(to_yaml(rung.config))
+    return result, asked, rung.given or str(file.resolve())
 
 
 def kept(path: Path, asked: dict) -> bool:

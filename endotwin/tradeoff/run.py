@@ -7,17 +7,15 @@ import os
 import platform
 import shutil
 from collections.abc import Callable
-from dataclasses import asdict
 from pathlib import Path
 
-from endotwin.config import to_yaml
 from endotwin.errors import OutputError
 from endotwin.output import TRADEOFF, check_free
 from endotwin.readers import open_sequence
 from endotwin.sequence import Sequence
 from endotwin.tradeoff import crops, effects, plot, report
 from endotwin.tradeoff.ladder import Rung
-from endotwin.tradeoff.measure import keep, kept, measured
+from endotwin.tradeoff.measure import due, keep, measured
 from endotwin.tradeoff.summary import summary, write_csv
 from endotwin.twin import Source
 
@@ -119,13 +117,10 @@ def _measure(
     rung: Rung, repeat: int, sequence: Sequence, geometry: str, work: Path, patch: crops.Patch
 ) -> None:
     """Measure one run of a rung and keep it, unless that was done; the first one's crop is kept too."""
-    result = work / "results" / f"{rung.name}.{repeat}.json"
-    asked = {"config": asdict(rung.config)}
-    if kept(result, asked):
+    if (run := due(rung, repeat, work)) is None:
         return
-    file = work / "rungs" / f"{rung.name}.yaml"
-    file.write_text(to_yaml(rung.config))
-    commands = rung.commands(sequence.path.resolve(), rung.given or str(file.resolve()), geometry, repeat)
+    result, asked, config = run
+    commands = rung.commands(sequence.path.resolve(), config, geometry, repeat)
     measurement = measured(commands, [*sequence.color_files, *sequence.depth_files], work.resolve())
     if repeat == 0:
         crops.save(crops.render(work / "twin", patch), work / "crops" / f"{rung.name}.png")
