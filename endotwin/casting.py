@@ -87,6 +87,21 @@ class Caster:
         """
         return self._first_hits(lambda part: (origins[part], directions[part]), len(directions))
 
+    def unobstructed(self, origins: np.ndarray, directions: np.ndarray, length_mm: np.ndarray) -> np.ndarray:
+        """Bool [N]: rays as of ``cast_rays`` that meet nothing nearer than ``length_mm`` [N]. That takes a
+        third of the time of finding what they meet."""
+        clear = np.zeros(len(directions), bool)
+
+        def run(part: slice) -> None:
+            start, towards, rows = _finite(origins[part], directions[part], part)
+            start, towards, reach = (
+                np.ascontiguousarray(x, np.float32) for x in (start, towards, length_mm[rows])
+            )
+            clear[rows] = self._scene.run(start, towards, dists=reach, query="OCCLUDED") < 0
+
+        self._in_parts(run, len(directions))
+        return clear
+
     def cast(
         self, camera: Camera, T_world_camera: np.ndarray, mask: np.ndarray | None = None
     ) -> Correspondences:
@@ -114,25 +129,22 @@ class Caster:
         distance_mm = np.full(count, np.inf, np.float32)
 
         def run(part: slice) -> None:
-            origins, directions = rays(part)
-            if np.isfinite(directions).all() and np.isfinite(origins).all():
-                rows = part
-            else:
-                finite = np.flatnonzero(
-                    np.isfinite(directions).all(axis=1) & np.isfinite(origins).all(axis=1)
-                )
-                origins, directions, rows = origins[finite], directions[finite], part.start + finite
+            origins, directions, rows = _finite(*rays(part), part)
             triangle[rows], barycentric[rows], distance_mm[rows] = self._trace(origins, directions)
 
-        starts = range(0, count, RAYS_PER_TASK) if len(self.surface.triangles) else ()
-        parts = [slice(start, start + RAYS_PER_TASK) for start in starts]
+        if len(self.surface.triangles):
+            self._in_parts(run, count)
+        return triangle, barycentric, distance_mm
+
+    def _in_parts(self, run: Callable[[slice], None], count: int) -> None:
+        """Call ``run`` with parts of ``count`` rays, on the caster's threads."""
+        parts = [slice(start, start + RAYS_PER_TASK) for start in range(0, count, RAYS_PER_TASK)]
         if min(self._threads, len(parts)) > 1:
             with ThreadPoolExecutor(self._threads) as pool:
                 list(pool.map(run, parts))
         else:
             for part in parts:
                 run(part)
-        return triangle, barycentric, distance_mm
 
     def _trace(
         self, origins: np.ndarray, directions: np.ndarray
@@ -151,3 +163,13 @@ class Caster:
         barycentric = np.stack([1 - u - v, u, v], axis=1)
         barycentric[missed], found["tfar"][missed] = 0, np.inf
         return found["primID"], barycentric, found["tfar"]
+
+
+def _finite(
+    origins: np.ndarray, directions: np.ndarray, part: slice
+) -> tuple[np.ndarray, np.ndarray, slice | np.ndarray]:
+    """Those of the ``part``'s rays that are finite, and which of all rays they are."""
+    if np.isfinite(directions).all() and np.isfinite(origins).all():
+        return origins, directions, part
+    finite = np.flatnonzero(np.isfinite(directions).all(axis=1) & np.isfinite(origins).all(axis=1))
+    return origins[finite], directions[finite], part.start + finite

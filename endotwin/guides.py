@@ -97,6 +97,5 @@ def visible_from(
         distance_mm = np.maximum(np.sqrt(dot(ray, ray)), DISTANCE_MIN_MM)
         directions = (ray / distance_mm[:, None]) @ rotation.T
         origin = np.broadcast_to(centre + rotation @ guide_mm, directions.shape)
-        _, _, reach_mm = caster.cast_rays(origin, directions)
-        seen[:, k] = reach_mm >= distance_mm * (1 - SHADOW_BIAS)
+        seen[:, k] = caster.unobstructed(origin, directions, distance_mm * (1 - SHADOW_BIAS))
     return seen

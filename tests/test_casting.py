@@ -74,8 +74,23 @@ def test_rays_that_are_not_finite_hit_nothing_and_leave_the_others_alone(surface
     found = Caster(surface).cast_rays(origins, directions)
     assert (found[0][::3] == -1).all() and (found[0][1::3] == -1).all()
     assert np.isinf(found[2][::3]).all()
+    clear = Caster(surface).unobstructed(origins, directions, np.zeros(1000, np.float32))
+    np.testing.assert_array_equal(clear, np.arange(1000) % 3 == 2)
     for array, reference in zip(found, expected, strict=True):
         np.testing.assert_array_equal(array[2::3], reference[2::3])
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_a_ray_is_unobstructed_up_to_what_it_hits_first(surface, threads):
+    origins, directions = random_rays(100_000)
+    origins[::7] *= 4
+    caster = Caster(surface, threads)
+    _, _, distance_mm = caster.cast_rays(origins, directions)
+    hit = np.isfinite(distance_mm)
+    assert 0.5 < hit.mean() < 1
+    reach_mm = np.where(hit, distance_mm, 1e6)
+    assert caster.unobstructed(origins, directions, reach_mm * 0.999).all()
+    np.testing.assert_array_equal(caster.unobstructed(origins, directions, reach_mm * 1.001), ~hit)
 
 
 def test_no_rays_and_no_triangles_give_no_hits(surface):

@@ -63,8 +63,8 @@ def about(distance_mm: np.ndarray, uv: np.ndarray) -> tuple[np.ndarray, np.ndarr
 
 
 def _reached(caster: Caster, T_world_camera: np.ndarray, seen: Sighting) -> np.ndarray:
-    """Bool [N]: vertices of ``seen`` that the first hit of a ray towards them does not precede."""
+    """Bool [N]: vertices of ``seen`` with nothing between them and the lens."""
     centre = caster.surface.to_local(T_world_camera)[:3, 3].astype(np.float32)
     directions = (caster.surface.vertices_mm[seen.vertex] - centre) / seen.distance_mm[:, None]
-    _, _, hit_mm = caster.cast_rays(np.broadcast_to(centre, directions.shape), directions)
-    return hit_mm >= seen.distance_mm * (1 - CLEARANCE)
+    length_mm = seen.distance_mm * (1 - CLEARANCE)
+    return caster.unobstructed(np.broadcast_to(centre, directions.shape), directions, length_mm)

@@ -42,9 +42,9 @@ def seen_from(points: np.ndarray, caster: Caster, camera: Camera, T_world_other:
     distance_mm = np.linalg.norm(towards, axis=1)
     local = (origin - caster.surface.origin_mm).astype(np.float32)
     rays = (towards / np.maximum(distance_mm, 1e-9)[:, None]).astype(np.float32)
-    _, _, first_mm = caster.cast_rays(np.broadcast_to(local, rays.shape), rays)
+    length_mm = distance_mm * (1 - HIDDEN) - HIDDEN_MM
     seen = np.zeros(len(points), bool)
-    seen[chosen] = first_mm >= distance_mm * (1 - HIDDEN) - HIDDEN_MM
+    seen[chosen] = caster.unobstructed(np.broadcast_to(local, rays.shape), rays, length_mm)
     return seen
 
 
@@ -56,8 +56,8 @@ def hides_surface(
     towards = points - T_world_camera[:3, 3]
     rays = (towards / np.linalg.norm(towards, axis=1, keepdims=True)).astype(np.float32)
     behind = (points - caster.surface.origin_mm).astype(np.float32) + BEHIND_MM * rays
-    _, _, further_mm = caster.cast_rays(behind, rays)
-    return hits.distance_mm + BEHIND_MM + further_mm <= OCCLUSION_RANGE_MM
+    left_mm = OCCLUSION_RANGE_MM - hits.distance_mm - BEHIND_MM
+    return ~caster.unobstructed(behind, rays, left_mm)
 
 
 def to_camera_frame(points: np.ndarray, T_world_camera: np.ndarray) -> np.ndarray:
