@@ -12,13 +12,16 @@ from torch import Tensor
 from endotwin.effects import Decision
 from endotwin.effects.coat import Coat
 from endotwin.effects.probe import Verdict, compared
-from endotwin.fit.fixed_effects import Design, regress
+from endotwin.fit.fixed_effects import Design, regress, robust_losses
 from endotwin.fit.model import GLOBALS, Globals
 from endotwin.fit.within import DIFFUSE_SIN2, LEAST_SIGHTINGS, Within
 
 ROUGHNESSES = (0.06, 0.09, 0.13, 0.19, 0.27)
 PIXELS = 60_000
 """Of the highlights, all of some vertices; more would not change the mind."""
+
+SEARCH_ROUNDS = 2
+"""Of the regression by which roughnesses are ranked."""
 
 F0 = GLOBALS.index("ln f0")
 
@@ -49,18 +52,21 @@ def film(within: Within, material: Tensor, shared: Globals, noise: float) -> tup
     """
     shiny = within.samples.sin2 < DIFFUSE_SIN2
     shiny &= torch.from_numpy(within.vertex % max(1, int(shiny.sum()) // PIXELS) == 0)
-    best = Coat(0.0, ROUGHNESSES[0]), Verdict(0.0, 0.0)
+    width, least, best = 0.0, np.inf, None
     for roughness in ROUGHNESSES:
-        trial = replace(shared, coat=Coat(0.0, roughness))
-        seen = within.sightings(material, trial, shiny, noise)
+        seen = within.sightings(material, replace(shared, coat=Coat(0.0, roughness)), shiny, noise)
         if len(seen.residual) < LEAST_SIGHTINGS:
-            return best
-        with_coat = Design(np.c_[seen.slopes[:, F0], seen.by_coat], seen.vertex, within.count)
-        without = replace(with_coat, columns=with_coat.columns[:, :1])
-        weight = float(regress(seen.residual, with_coat).coefficients[1])
-        half = (np.random.default_rng(0).random(within.count) < 0.5)[seen.vertex]
-        width = regress(seen.residual, without).width
-        verdict = compared(seen.residual, without, with_coat, half, width)
-        if weight > 0 and verdict.gain_db > best[1].gain_db:
-            best = Coat(weight, roughness), verdict
-    return best
+            break
+        vertex = np.unique(seen.vertex, return_inverse=True)[1].reshape(-1)
+        coated = Design(np.c_[seen.slopes[:, F0], seen.by_coat], vertex, int(vertex.max()) + 1)
+        plain = replace(coated, columns=coated.columns[:, :1])
+        width = width or regress(seen.residual, plain).width
+        found = regress(seen.residual, coated, rounds=SEARCH_ROUNDS)
+        loss = float(robust_losses(seen.residual, coated, found, width).sum())
+        if found.coefficients[1] > 0 and loss < least:
+            least, best = loss, (Coat(float(found.coefficients[1]), roughness), seen.residual, plain, coated)
+    if best is None:
+        return Coat(0.0, ROUGHNESSES[0]), Verdict(0.0, 0.0)
+    coat, residual, plain, coated = best
+    half = (np.random.default_rng(0).random(plain.count) < 0.5)[plain.group]
+    return coat, compared(residual, plain, coated, half, width)
