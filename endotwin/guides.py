@@ -18,8 +18,9 @@ SHADOW_BIAS = 0.015
 """A point is in shadow where a ray to it ends this share of its length before it: a fold rim throws
 shadows from farther away, and the mesh's own facets must throw none."""
 
-PROFILES = ("cosine", "exponential")
-"""Angular shapes of the light: cosⁿθ (Han & Wu 2025), e^{−n(1−cosθ)} (EndoMapper: Azagra et al. 2023)."""
+COSINE, EXPONENTIAL = 0.0, 1.0
+"""Angular shapes of the light: cosⁿθ (Han & Wu 2025), e^{−n(1−cosθ)} (EndoMapper: Azagra et al. 2023). A
+profile between them mixes their logarithms."""
 
 AT_LENS = ((0.0, 0.0, 0.0),)
 
@@ -47,16 +48,18 @@ class Guided:
         return Guided(**{name: value[index] for name, value in vars(self).items()})
 
 
-def log_axis(cos_axis: np.ndarray, profile: str) -> np.ndarray:
+def log_axis(cos_axis: np.ndarray, profile: float) -> np.ndarray:
     """Logarithm of the light's angular shape for exponent 1, of cosθ at least COS_MIN."""
-    return np.log(cos_axis) if profile == "cosine" else cos_axis - 1
+    if profile == COSINE:
+        return np.log(cos_axis)
+    return (1 - profile) * np.log(cos_axis) + profile * (cos_axis - 1)
 
 
 def guided(
     points_mm: np.ndarray,
     normals: np.ndarray,
     guides_mm: np.ndarray,
-    profile: str,
+    profile: float,
     visible: np.ndarray | None = None,
 ) -> Guided:
     """What guides at ``guides_mm`` [K, 3] do to ``points_mm`` [N, 3] with unit ``normals`` [N, 3].

@@ -13,7 +13,7 @@ from torch import Tensor
 from endotwin import shading
 from endotwin.casting import Caster, Correspondences
 from endotwin.effects.coat import F0_WATER
-from endotwin.guides import AT_LENS, Guided, guided, log_axis, visible_from
+from endotwin.guides import AT_LENS, COSINE, Guided, guided, log_axis, visible_from
 from endotwin.incidence import COS_MIN, incidence_on
 from endotwin.radiosity import Radiosity
 from endotwin.twin import Twin
@@ -32,7 +32,7 @@ class Illumination:
         self._caster = caster
         self._radiosity = before._radiosity if before else None
         self._albedo = None
-        if "interreflection" in twin.effects:
+        if twin.effects.bounce > 0:
             cell_mm = twin.effects["interreflection"].cell_mm
             if self._radiosity is None or self._radiosity.cell_mm != cell_mm:
                 self._radiosity = Radiosity(twin.surface, caster, cell_mm)
@@ -60,7 +60,7 @@ class Illumination:
             for guide in effects.guides_mm or AT_LENS
         ]
         direct = radiosity.direct(lamps, light.n, light.q).mean(axis=1, keepdims=True)
-        return radiosity.to_vertex @ radiosity.indirect(direct, self._albedo)[:, 0]
+        return radiosity.to_vertex @ (effects.bounce * radiosity.indirect(direct, self._albedo)[:, 0])
 
 
 @dataclass(frozen=True)
@@ -118,7 +118,7 @@ class ViewLight:
     ) -> Tensor:
         geometry = incidence_on(normals, hits, directions)
         cos, sin2, cone, distance = (torch.from_numpy(value) for value in vars(geometry).values())
-        if self.twin.effects.profile != "cosine":
+        if self.twin.effects.profile != COSINE:
             cone = torch.from_numpy(log_axis(np.exp(geometry.log_cos_axis), self.twin.effects.profile))
         strength = self._strength(cone, distance) * cos
         if self.twin.materials.diffuse == "burley":

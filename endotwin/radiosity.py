@@ -110,9 +110,9 @@ class Radiosity:
         matrices = (self.form_factors, self.to_vertex)
         return sum(m.data.nbytes + m.indices.nbytes + m.indptr.nbytes for m in matrices)
 
-    def lamp(self, T_local_camera: np.ndarray, guide_mm: np.ndarray, shape: str) -> Lamp:
-        """What a guide at ``guide_mm`` [3] (camera frame) of the pose [4, 4] lights, with ``shape`` of its
-        cone."""
+    def lamp(self, T_local_camera: np.ndarray, guide_mm: np.ndarray, profile: float) -> Lamp:
+        """What a guide at ``guide_mm`` [3] (camera frame) of the pose [4, 4] lights, with the angular
+        shape ``profile`` (``guides.log_axis``)."""
         rotation = T_local_camera[:3, :3]
         source = (T_local_camera[:3, 3] + rotation @ guide_mm).astype(np.float32)
         ray = self._points_mm - source
@@ -120,16 +120,17 @@ class Radiosity:
         ray = ray / distance_mm[:, None]
         cos = -dot(ray, self._normals)
         facing = np.flatnonzero(cos > 0)
-        _, _, reach_mm = self._caster.cast_rays(np.broadcast_to(source, (len(facing), 3)), ray[facing])
-        lit = reach_mm >= distance_mm[facing] * (1 - SHADOW_BIAS)
+        length_mm = distance_mm[facing] * (1 - SHADOW_BIAS)
         seen = np.zeros(len(cos), bool)
-        seen[facing] = lit & np.isfinite(reach_mm)
-        shape2 = (self.count, POINTS)
+        seen[facing] = self._caster.unobstructed(
+            np.broadcast_to(source, (len(facing), 3)), ray[facing], length_mm
+        )
+        shape = (self.count, POINTS)
         axis = np.maximum(ray @ rotation[:, 2].astype(np.float32), COS_MIN)
         return Lamp(
-            cos=np.where(seen, cos, 0).astype(np.float32).reshape(shape2),
-            log_axis=log_axis(axis, shape).astype(np.float32).reshape(shape2),
-            log_distance=np.log(distance_mm).reshape(shape2),
+            cos=np.where(seen, cos, 0).astype(np.float32).reshape(shape),
+            log_axis=log_axis(axis, profile).astype(np.float32).reshape(shape),
+            log_distance=np.log(distance_mm).reshape(shape),
         )
 
     def direct(self, lamps: list[Lamp], n: float, q: float) -> np.ndarray:

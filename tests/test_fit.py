@@ -87,6 +87,15 @@ def test_the_example_predicts_photos_that_it_never_saw(colon):
     assert endotwin.evaluate(colon).psnr_covered > 33
 
 
+def test_interreflection_that_no_photo_shows_is_fitted_away(colon):
+    forced = fit(colon, effects={"interreflection": "on"})
+    assert forced.decisions["interreflection"].state == "on"
+    assert forced.effects["interreflection"].strength == 0
+    assert "none of it" in forced.decisions["interreflection"].reason
+    assert forced.response.gamma == pytest.approx(colon.response.gamma, rel=0.01)
+    assert endotwin.evaluate(forced).psnr_covered > endotwin.evaluate(colon).psnr_covered - 0.1
+
+
 def test_materials_are_physical_and_the_brightest_albedo_has_the_agreed_scale(colon):
     materials = colon.materials
     assert materials.base_color.min() >= 0 and materials.base_color.max() <= 1

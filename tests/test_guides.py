@@ -6,7 +6,7 @@ import trimesh
 
 from endotwin.casting import Caster
 from endotwin.fusion.mesh import surface_of
-from endotwin.guides import AT_LENS, guided, visible_from
+from endotwin.guides import AT_LENS, COSINE, EXPONENTIAL, guided, log_axis, visible_from
 from endotwin.incidence import dot, unit
 
 RADIUS_MM, CENTRE_MM, WALL_MM = 2.0, 10.0, 20.0
@@ -24,7 +24,7 @@ def points() -> tuple[np.ndarray, np.ndarray]:
 
 def test_a_guide_at_the_lens_is_the_light_at_the_lens(points):
     points_mm, normals = points
-    lit = guided(points_mm, normals, np.zeros((1, 3)), "cosine")
+    lit = guided(points_mm, normals, np.zeros((1, 3)), COSINE)
     view = unit(points_mm)
     np.testing.assert_allclose(lit.cos_i[:, 0], -dot(normals, view), atol=1e-6)
     np.testing.assert_allclose(lit.cos_d[:, 0], 1, atol=1e-6)
@@ -38,16 +38,23 @@ def test_both_profiles_fall_alike_near_the_axis(points):
     points_mm, normals = points
     cosine, exponential = (
         guided(points_mm, normals, AT_LENS, profile).log_axis[:, 0].numpy()
-        for profile in ("cosine", "exponential")
+        for profile in (COSINE, EXPONENTIAL)
     )
     narrow = cosine > -0.02
     np.testing.assert_allclose(cosine[narrow], exponential[narrow], atol=2e-4)
     assert (cosine <= exponential + 1e-6).all()
 
 
+def test_a_mixed_profile_is_the_product_of_both_shapes():
+    cos_axis, n, share = np.linspace(0.01, 1, 50), 2.5, 0.3
+    shape = np.exp(n * log_axis(cos_axis, share))
+    product = cos_axis ** (n * (1 - share)) * np.exp(-n * share * (1 - cos_axis))
+    np.testing.assert_allclose(shape, product, rtol=1e-12)
+
+
 def test_a_guide_behind_the_surface_gives_no_light(points):
     points_mm, normals = points
-    lit = guided(points_mm, -normals, AT_LENS, "cosine")
+    lit = guided(points_mm, -normals, AT_LENS, COSINE)
     assert (lit.cos_i == 0).all()
 
 

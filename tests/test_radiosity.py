@@ -6,6 +6,7 @@ import trimesh
 
 from endotwin.casting import Caster
 from endotwin.fusion.mesh import surface_of
+from endotwin.guides import COSINE
 from endotwin.radiosity import BOUNCES, Radiosity
 
 RADIUS_MM = 10.0
@@ -46,7 +47,7 @@ def test_light_at_the_centre_of_a_sphere_bounces_to_the_geometric_series(sphere,
 
 
 def test_a_lamp_at_the_centre_lights_a_sphere_evenly(sphere):
-    lamp = sphere.lamp(np.eye(4), np.zeros(3), "cosine")
+    lamp = sphere.lamp(np.eye(4), np.zeros(3), COSINE)
     direct = sphere.direct([lamp], n=0.0, q=2.0)
     np.testing.assert_allclose(direct, RADIUS_MM**-2.0, rtol=0.02)
 

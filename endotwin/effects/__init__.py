@@ -63,9 +63,14 @@ class Effects(Mapping[str, Effect]):
         return self["offset"].guides_mm if "offset" in self else None
 
     @property
-    def profile(self) -> str:
-        """Angular shape of the light, one of ``guides.PROFILES``."""
-        return "exponential" if "profile" in self else "cosine"
+    def profile(self) -> float:
+        """Angular shape of the light (``guides.log_axis``), 0 for cosⁿθ."""
+        return self["profile"].exponential if "profile" in self else 0.0
+
+    @property
+    def bounce(self) -> float:
+        """Strength of interreflection; 0 without it."""
+        return self["interreflection"].strength if "interreflection" in self else 0.0
 
     def to_dict(self) -> dict[str, dict]:
         """Parameters by name, as plain values."""

@@ -6,6 +6,8 @@ import time
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from endotwin.casting import Caster
 from endotwin.effects import Decision, Effect, Effects
 from endotwin.effects.gain import Gain
@@ -18,7 +20,7 @@ from endotwin.effects.specular import Specular
 from endotwin.effects.vignetting import Vignetting
 from endotwin.fit.samples import Samples
 from endotwin.fit.start import PRIOR
-from endotwin.guides import AT_LENS
+from endotwin.guides import AT_LENS, COSINE, EXPONENTIAL
 from endotwin.twin import Light, Twin
 
 ORDER = ("offset", "interreflection", "gain", "profile", "vignetting")
@@ -100,7 +102,7 @@ class _Trial:
             self._seconds[name] += time.perf_counter() - began
         else:
             verdict = verdict or self._tried(name)
-            self._kept = self._found[name]
+            self._kept = self._mixed() if name == "profile" else self._found[name]
             if self._kept.hypothesis.guides_mm != AT_LENS:
                 began = time.perf_counter()
                 self._kept = self._probe.fit(Search(self._probe, self._kept).polished())
@@ -169,8 +171,17 @@ class _Trial:
         if name == "interreflection":
             return replace(kept, bounced=bounced(self._probe, kept))
         if name == "profile":
-            return replace(kept, profile="exponential")
+            return replace(kept, profile=EXPONENTIAL)
         return replace(kept, **{name: True})
+
+    def _mixed(self) -> Fitted:
+        """Beside what was kept, the profile at the foot of the parabola through the losses of three."""
+        kept = self._kept.hypothesis
+        profiles = (COSINE, (COSINE + EXPONENTIAL) / 2, EXPONENTIAL)
+        losses = [self._probe.loss(replace(kept, profile=p), self._kept) for p in profiles]
+        bend, slope, _ = np.polyfit(profiles, losses, 2)
+        foot = -slope / (2 * bend) if bend > 0 else profiles[int(np.argmin(losses))]
+        return self._probe.fit(replace(kept, profile=float(np.clip(foot, COSINE, EXPONENTIAL))))
 
     def _adopt_offset(self, forced: bool) -> None:
         hypothesis = self._kept.hypothesis
@@ -216,8 +227,8 @@ class _Trial:
             effects.append(Shadows())
         if kept.hypothesis.bounced is not None:
             effects.append(Interreflection(cell_mm(probe.samples.log_distance.numpy())))
-        if kept.hypothesis.profile != "cosine":
-            effects.append(Profile())
+        if self._decisions["profile"].state == "on":
+            effects.append(Profile(kept.hypothesis.profile))
         if kept.hypothesis.gain:
             log_gain = kept.log_gain - kept.log_gain.mean()
             effects.append(Gain(tuple(map(int, probe.frames)), tuple(map(float, log_gain))))

@@ -33,12 +33,14 @@ STEP = 0.05
 class Interreflection(Effect):
     """Diffuse light between patches of the surface (see ``radiosity``), from each frame's own light.
 
-    It adds b/π·E to a point's radiance, E the indirect irradiance there.
+    It adds b/π·E to a point's radiance, E the indirect irradiance there times ``strength``. That is 0 where
+    the photos show none of it.
     """
 
     name: ClassVar[str] = "interreflection"
     kind: ClassVar[str] = "light"
     cell_mm: float = parameter(3.0, 1e-3, 1e3, "mm")
+    strength: float = parameter(1.0, 0.0, 1.0, "1")
 
 
 def cell_mm(log_distance: np.ndarray) -> float:

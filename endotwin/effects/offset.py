@@ -110,7 +110,7 @@ class Search:
         return self._fitted_loss(guides_mm, visible)
 
     def _fitted_loss(self, guides_mm: np.ndarray, visible: np.ndarray) -> float:
-        return self._probe.loss(self._with(guides_mm), visible, self._base)
+        return self._probe.loss(self._with(guides_mm), self._base, visible)
 
     def _with(self, guides_mm: np.ndarray) -> Hypothesis:
         guides = tuple(tuple(float(c) for c in guide) for guide in guides_mm)

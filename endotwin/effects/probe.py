@@ -18,7 +18,7 @@ import torch
 
 from endotwin.fit.fixed_effects import Design, FixedEffects, regress, robust_losses
 from endotwin.fit.start import BRIGHT, COS_MIN, DARK, HIGHLIGHT_SIN2, PRIOR
-from endotwin.guides import AT_LENS, guided, visible_from
+from endotwin.guides import AT_LENS, COSINE, guided, log_axis, visible_from
 from endotwin.incidence import unit
 
 if TYPE_CHECKING:
@@ -64,7 +64,7 @@ class Hypothesis:
 
     guides_mm: tuple[tuple[float, float, float], ...] = AT_LENS
     shadows: bool = False
-    profile: str = "cosine"
+    profile: float = COSINE
     gain: bool = False
     vignetting: bool = False
     bounced: Bounced | None = None
@@ -126,8 +126,8 @@ class Probe:
         surface = twin.surface
         self.twin, self.caster = twin, caster
         generator = np.random.default_rng(seed)
-        color = samples.color.numpy()
-        usable = (color.max(axis=1) < BRIGHT) & (color.min(axis=1) > DARK)
+        darkest, brightest = (x.numpy() for x in samples.color.aminmax(dim=1))
+        usable = (brightest < BRIGHT) & (darkest > DARK)
         usable &= (samples.cos.numpy() > COS_MIN) & (samples.sin2.numpy() > HIGHLIGHT_SIN2)
         rows = np.flatnonzero(usable)
         corner = samples.barycentric.argmax(dim=1).numpy()[rows]
@@ -214,9 +214,9 @@ class Probe:
             base.hypothesis, replace(base.design, columns=np.c_[base.design.columns, columns])
         )
 
-    def loss(self, hypothesis: Hypothesis, visible: np.ndarray, base: Fitted) -> float:
-        """Robust loss of all pixels under guides that see them as ``visible`` [N, K] says, linearised about
-        ``base``."""
+    def loss(self, hypothesis: Hypothesis, base: Fitted, visible: np.ndarray | None = None) -> float:
+        """Robust loss of all pixels, linearised about ``base``, under guides that see them as ``visible`` [N,
+        K] says (found out unless given)."""
         design = self._design(hypothesis, self._light(hypothesis, visible).columns(base.n, base.q))
         found = regress(self.target, design, len(self.frames), rounds=2)
         return float(robust_losses(self.target, design, found, base.effects.width).sum())
@@ -241,19 +241,17 @@ class Probe:
     def _light(self, hypothesis: Hypothesis, visible: np.ndarray | None = None) -> LogLight:
         if hypothesis.guides_mm == AT_LENS:
             cos, log_distance = self.samples.cos.numpy()[:, None], self.samples.log_distance.numpy()[:, None]
-            log_axis = self.samples.log_cos_axis.numpy()[:, None]
-            if hypothesis.profile == "exponential":
-                log_axis = np.exp(log_axis) - 1
+            axis = self.samples.log_cos_axis.numpy()[:, None]
+            if hypothesis.profile != COSINE:
+                axis = log_axis(np.exp(axis), hypothesis.profile)
         else:
             guides_mm = np.asarray(hypothesis.guides_mm, np.float32)
             if hypothesis.shadows and visible is None:
                 visible = np.stack([self.visible(guide) for guide in guides_mm], axis=1)
             lit = guided(self.points_mm, self.normals, guides_mm, hypothesis.profile, visible)
-            cos, log_axis, log_distance = (
-                value.numpy() for value in (lit.cos_i, lit.log_axis, lit.log_distance)
-            )
+            cos, axis, log_distance = (value.numpy() for value in (lit.cos_i, lit.log_axis, lit.log_distance))
         log_cos = np.log(np.maximum(cos / cos.shape[1], math.exp(DARKEST)))
-        return LogLight(log_cos, log_axis, log_distance, hypothesis.bounced)
+        return LogLight(log_cos, axis, log_distance, hypothesis.bounced)
 
     @cached_property
     def vignetting_columns(self) -> np.ndarray:

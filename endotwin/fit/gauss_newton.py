@@ -323,6 +323,11 @@ def at_bounds(shared: Globals) -> list[str]:
     return [name for name, index in told.items() if float(shared.vector[index]) in GLOBAL_RANGE[index]]
 
 
+def darkest(shared: Globals) -> bool:
+    """Whether light between tissue asks for darker tissue than there is."""
+    return shared.log_scale <= GLOBAL_RANGE[-1][0]
+
+
 def bounded(shared: Globals, vector: Tensor) -> Globals:
     limits = torch.tensor(GLOBAL_RANGE, dtype=torch.float64)[: len(vector)]
     return replace(shared, vector=torch.clamp(vector, limits[:, 0], limits[:, 1]))

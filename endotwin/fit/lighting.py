@@ -16,7 +16,7 @@ from endotwin.fit.gauss_newton import HUBER, GaussNewton, State
 from endotwin.fit.model import Globals, at_pixels, slope_by_log_exposure
 from endotwin.fit.normal import Residual
 from endotwin.fit.samples import Bounce, Samples
-from endotwin.guides import AT_LENS, Guided, guided, log_axis, visible_from
+from endotwin.guides import AT_LENS, COSINE, Guided, guided, log_axis, visible_from
 from endotwin.incidence import unit
 from endotwin.radiosity import Radiosity
 from endotwin.twin import Twin
@@ -29,7 +29,7 @@ def lit(samples: Samples, twin: Twin, caster: Caster, effects: Effects) -> Sampl
     """``samples`` as the effects light and expose them, all but interreflection."""
     if effects.guides_mm is not None:
         samples = replace(samples, guides=_guided(samples, twin, caster, effects))
-    elif effects.profile != "cosine":
+    elif effects.profile != COSINE:
         axis = torch.from_numpy(log_axis(samples.log_cos_axis.exp().numpy(), effects.profile))
         samples = replace(samples, log_cos_axis=axis)
     if "gain" in effects or "vignetting" in effects:
@@ -82,16 +82,27 @@ class Relighting:
     def __init__(self, twin: Twin, caster: Caster, effects: Effects, frames: np.ndarray):
         self.effects = effects
         self._twin = twin
-        self._bouncer = Bouncer(twin, caster, effects, frames) if "interreflection" in effects else None
+        self._bouncer = Bouncer(twin, caster, effects, frames) if effects.bounce else None
+
+    @property
+    def bounces(self) -> bool:
+        return self._bouncer is not None
 
     @property
     def needed(self) -> bool:
-        return self._bouncer is not None or "gain" in self.effects
+        return self.bounces or "gain" in self.effects
+
+    def without_bounce(self, solver: GaussNewton, state: State) -> State:
+        """From here on no light bounces: the photos show none. ``state`` as if there had never been any."""
+        self._bouncer = None
+        self.effects = self.effects.including(replace(self.effects["interreflection"], strength=0.0))
+        solver.relight(replace(solver.samples, bounce=None))
+        return replace(state, shared=state.shared.without_scale())
 
     def __call__(self, solver: GaussNewton, state: State) -> None:
         """Relight the samples of ``solver`` as ``state`` says."""
         samples, materials = solver.samples, state.materials
-        if self._bouncer is not None:
+        if self.bounces:
             roughness = at_pixels(samples, solver.triangles, materials[:, 3:])[:, 0]
             per_triangle = materials[solver.triangles].mean(dim=1)
             samples = self._bouncer.bounced(samples, roughness, per_triangle, state.shared)

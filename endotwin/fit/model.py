@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -64,6 +64,10 @@ class Globals:
     @property
     def f0(self) -> float:
         return math.exp(self.vector[4]) if self.specular else 0.0
+
+    def without_scale(self) -> Globals:
+        """The same without interreflection."""
+        return replace(self, vector=self.vector[: len(GLOBALS)])
 
     @property
     def log_scale(self) -> float:

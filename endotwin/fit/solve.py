@@ -21,7 +21,14 @@ from endotwin.effects.decide import decide
 from endotwin.effects.price import priced
 from endotwin.errors import SequenceError
 from endotwin.fit.film import judged as judged_coat
-from endotwin.fit.gauss_newton import ROUGHNESS_MEAN, GaussNewton, State, at_bounds, roughness_to_raw
+from endotwin.fit.gauss_newton import (
+    ROUGHNESS_MEAN,
+    GaussNewton,
+    State,
+    at_bounds,
+    darkest,
+    roughness_to_raw,
+)
 from endotwin.fit.lighting import Relighting, lit
 from endotwin.fit.model import Globals, at_pixels
 from endotwin.fit.pace import ITERATIONS, LIGHT, Pace
@@ -104,7 +111,7 @@ def fit_twin(twin: Twin, pace: Pace, seed: int, states: Mapping[str, str]) -> Tw
         telling = np.flatnonzero(_telling(samples, surface))
         if not len(telling):
             telling = np.arange(len(samples))
-            if int(samples.color.max(dim=1).values.min()) >= BRIGHT:
+            if int(samples.color.amax(dim=1).min()) >= BRIGHT:
                 logger.warning(
                     "no training photo of %s has an unclipped pixel: its light and materials are guesses",
                     twin.source.path,
@@ -145,16 +152,22 @@ def fit_twin(twin: Twin, pace: Pace, seed: int, states: Mapping[str, str]) -> Tw
         )
     with stopwatch.stage("price"):
         decisions = {**decided.decisions, "coat": coat}
+        if "interreflection" in decided.effects and not relighting.bounces:
+            decisions["interreflection"] = _without_bounce(decisions["interreflection"])
         fitted = priced(_fitted(twin, state, relighting.effects, decisions), caster)
     return fitted.with_record(
         fit={"method": "twin", "undetermined": list(start.undetermined), **stopwatch.to_dict()}
     )
 
 
+def _without_bounce(decision: Decision) -> Decision:
+    return replace(decision, reason=f"{decision.reason}; but the fit finds none of it: strength 0")
+
+
 def _telling(samples: Samples, surface: Surface) -> np.ndarray:
     """Bool [N]: samples off the creases of the surface and below saturation."""
     smooth = surface.normal_agreement() > np.cos(np.radians(CERTAIN_NORMAL_DEG))
-    return smooth[samples.triangle.numpy()] & (samples.color.numpy().max(axis=1) < BRIGHT)
+    return smooth[samples.triangle.numpy()] & (samples.color.amax(dim=1).numpy() < BRIGHT)
 
 
 def _find_light(
@@ -177,19 +190,21 @@ def _find_light(
     mean = torch.cat([shown.median(dim=0).values, torch.tensor([roughness_to_raw(ROUGHNESS_MEAN)])])
     table = torch.zeros(operator.forward_csr.shape[1], 4)
     effects = relighting.effects
-    options = {"specular": "specular" in effects, "bounce": "interreflection" in effects}
+    options = {"specular": "specular" in effects, "bounce": relighting.bounces}
     shared = Globals.of(start.light, start.response, F0_DIELECTRIC, **options)
     state = State(operator, mean, table, shared)
     relighting(solver, state)
     ready = pace.stopwatch.total
     state, _ = solver.step(state, joint=False)
     step_s = pace.stopwatch.total - ready
-    bounce, steps = "interreflection" in effects, RELIGHT_STEPS if relighting.needed else LIGHT_STEPS
+    steps = RELIGHT_STEPS if relighting.needed else LIGHT_STEPS
     judged = Decision("off", "no time to judge")
     for number in range(steps):
         late = pace.left(LIGHT) <= 2 * step_s
-        if late and (bounce or number):
+        if late and (relighting.bounces or number):
             break
+        if relighting.bounces and darkest(state.shared):
+            state = relighting.without_bounce(solver, state)
         relighting(solver, state)
         within = Within.of(solver.samples, surface, unit)
         material = at_pixels(solver.samples, solver.triangles, state.materials)
@@ -197,14 +212,14 @@ def _find_light(
         if number == (0 if coat == "on" else COAT_STEP):
             layer, judged = judged_coat(within, material, shared, noise, coat)
             shared = replace(shared, coat=layer)
-        if bounce:
+        if relighting.bounces:
             solver.held = (*start.undetermined, "L0", *(("albedo scale",) * (number < HOLD_STEPS)))
         else:
             shared = within.renewed(material, shared, start.undetermined, noise)
         state = replace(state, shared=shared)
         if late:
             break
-        state, gain = solver.step(state, joint=bounce)
+        state, gain = solver.step(state, joint=relighting.bounces)
         pace.report("find the light", number + 1, steps)
         if gain < CONVERGED * solver.cost(state, solver.noise(state)):
             break
@@ -290,7 +305,7 @@ def _fitted(twin: Twin, state: State, effects: Effects, decisions: Mapping[str, 
     seen = twin.surface.seen_by > 0
     brightest = materials[seen if seen.any() else slice(None), :3].max(axis=1)
     scale = float(ALBEDO_TOP / np.percentile(brightest, 98))
-    if "interreflection" in effects:
+    if effects.bounce > 0:
         scale = math.exp(state.shared.log_scale)
     light, coat = state.shared.light, state.shared.coat
     if coat is not None:

@@ -96,7 +96,8 @@ def _coefficients(
     samples: Samples, vertex: np.ndarray, count: int
 ) -> tuple[float, float, float, tuple[str, ...]]:
     color = samples.color.numpy()
-    use = (color.max(axis=1) < BRIGHT) & (color.min(axis=1) > DARK)
+    darkest, brightest = (x.numpy() for x in samples.color.aminmax(dim=1))
+    use = (brightest < BRIGHT) & (darkest > DARK)
     use &= (samples.cos.numpy() > COS_MIN) & (samples.sin2.numpy() > HIGHLIGHT_SIN2)
     target = np.log(np.maximum(color, 1).mean(axis=1, dtype=np.float64) / 255)
     columns = [x.numpy() for x in (samples.log_cos_axis, -samples.log_distance, samples.cos.log())]

@@ -72,6 +72,15 @@ def test_a_profile_that_is_no_cosine_is_found(example):
     decided = decide(replace(samples, color=torch.from_numpy(color)), twin, caster, {})
     assert states(decided) == {**dict.fromkeys(LIGHT, "off"), "profile": "on"}
     assert decided.light.n == pytest.approx(4, rel=0.05)
+    assert decided.effects["profile"].exponential == pytest.approx(1, abs=0.1)
+
+
+def test_a_profile_forced_on_a_cosine_stays_one(example):
+    twin, caster, samples = example
+    decided = decide(samples, twin, caster, {"profile": "on"})
+    assert states(decided) == {**dict.fromkeys(LIGHT, "off"), "profile": "on"}
+    assert decided.effects["profile"].exponential == pytest.approx(0, abs=0.1)
+    assert decided.light.n == pytest.approx(2, rel=0.05)
 
 
 def test_an_effect_that_is_forced_off_stays_off(example):
