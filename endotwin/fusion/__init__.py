@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from collections.abc import Sequence as Indices
+from functools import partial
 
 import numpy as np
 
-from endotwin.ahead import ahead
 from endotwin.errors import OptionError
 from endotwin.fusion.agreement import Tolerance, measured_noise
 from endotwin.fusion.coverage import covered
@@ -19,7 +19,7 @@ from endotwin.fusion.reconcile import reconciled
 from endotwin.fusion.refine import refined
 from endotwin.fusion.smooth import smoothed
 from endotwin.fusion.tsdf import footprint_voxel_mm, fuse_tsdf
-from endotwin.fusion.views import View, read_views
+from endotwin.fusion.views import Shelf, View, read_views
 from endotwin.sequence import Sequence
 from endotwin.surface import Surface
 
@@ -48,8 +48,9 @@ def fuse(
     """The surface that agrees with the depth maps of ``frames``; the same input gives the same mesh.
 
     TSDF fusion, vertices refined against the depth maps, two rounds of carve and patch, small holes filled,
-    coverage. Noise that differs from pixel to pixel is averaged out first. A few frames are in memory at a
-    time. A frame without any valid depth is skipped with a warning in the log ``endotwin``.
+    coverage. Noise that differs from pixel to pixel is averaged out first. As many frames are in memory as
+    SHELF_BYTES hold, and a few more. A frame without any valid depth is skipped with a warning in the log
+    ``endotwin``.
 
     Args:
         frames: indices whose depth may be used; all unless given.
@@ -71,17 +72,16 @@ def fuse(
     sequence.require_valid_depth()
     camera, sample = sequence.camera, _spread(frames)
 
-    def measured(stage: str, chosen: list[int] = frames, warn: bool = False) -> Iterator[View]:
-        return read_views(sequence, _reported(stage, chosen, progress), warn)
-
-    finest_mm, median_mm = footprint_voxel_mm(camera, measured("voxel size", sample))
-    scatter = pixel_noise(measured("pixel noise", sample))
-    width_px = WIDTH_PX * scatter * median_mm / finest_mm
+    reading: dict = {"shelf": Shelf()}
 
     def views(stage: str, chosen: list[int] = frames, warn: bool = False) -> Iterator[View]:
-        read = measured(stage, chosen, warn)
-        return read if width_px < 1 else ahead(lambda view: denoised(view, scatter, width_px), read)
+        return read_views(sequence, _reported(stage, chosen, progress), warn, **reading)
 
+    finest_mm, median_mm = footprint_voxel_mm(camera, views("voxel size", sample))
+    scatter = pixel_noise(views("pixel noise", sample))
+    width_px = WIDTH_PX * scatter * median_mm / finest_mm
+    if width_px >= 1:
+        reading = {"shelf": Shelf(), "change": partial(denoised, noise=scatter, width_px=width_px)}
     doubt_positions(sequence, frames, median_mm)
     if voxel_mm is not None and voxel_mm > median_mm:
         raise OptionError(

@@ -22,12 +22,15 @@ def surface_of(
     while (flat := ~normals.any(axis=1)[triangles].all(axis=1)).any():
         triangles = triangles[~flat]
         normals = vertex_normals(vertices_mm, triangles)
-    used, triangles = np.unique(triangles, return_inverse=True)
+    is_used = np.zeros(len(vertices_mm), bool)
+    is_used[triangles] = True
+    used = np.flatnonzero(is_used)
+    triangles = (np.cumsum(is_used) - 1)[triangles]
     count = len(used)
     return Surface(
         origin_mm=np.asarray(origin_mm, np.float64),
         vertices_mm=np.ascontiguousarray(vertices_mm[used], np.float32),
-        triangles=triangles.reshape(-1, 3).astype(np.int32),
+        triangles=triangles.astype(np.int32),
         normals=normals[used],
         seen_by=np.zeros(count, np.int32),
         best_cosine=np.zeros(count, np.float32),
@@ -77,9 +80,14 @@ def boundary_edges(triangles: np.ndarray) -> np.ndarray:
     edges = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]]).astype(
         np.int64
     )
-    count = int(triangles.max(initial=0)) + 1
-    there, back = edges[:, 0] * count + edges[:, 1], edges[:, 1] * count + edges[:, 0]
-    return edges[~np.isin(there, back)]
+    low, high = edges.min(axis=1), edges.max(axis=1)
+    there = 2 * (low * (int(triangles.max(initial=0)) + 1) + high) + (edges[:, 0] > edges[:, 1])
+    ascending = np.sort(there)
+    once = ascending[np.diff(ascending, prepend=-1) > 0]
+    first = np.flatnonzero(once[1:] == once[:-1] ^ 1)  # of the two directions of an edge
+    lonely = np.delete(once, np.r_[first, first + 1])
+    found = np.r_[lonely, -1][np.searchsorted(lonely, there)]
+    return edges[(found == there) & (low != high)]
 
 
 def pieces(vertex_count: int, triangles: np.ndarray) -> np.ndarray:
