@@ -16,7 +16,6 @@ from torch import Tensor
 
 from endotwin.fit.model import Globals, at_pixels, linearise
 from endotwin.fit.samples import Samples
-from endotwin.hashgrid import to_torch
 
 CHANNELS = 4
 """Base colour red, green, blue; roughness."""
@@ -59,27 +58,25 @@ class MeshPattern:
         self.vertex_count = vertex_count
         hit, self.compact = np.unique(samples.triangle.numpy(), return_inverse=True)
         self.corners = triangles[hit]
-        rows = np.concatenate([self.corners[:, [i, j]].T.ravel() for i, j in CORNER_PAIRS])
-        columns = np.concatenate([self.corners[:, [j, i]].T.ravel() for i, j in CORNER_PAIRS])
-        key = rows.astype(np.int64) * vertex_count + columns
-        # A diagonal pair fills both of its slots with the same entry: the second is dropped by a weight of 0.
-        self._order = np.argsort(key, kind="stable")
-        key = key[self._order]
-        first = np.flatnonzero(np.r_[True, key[1:] != key[:-1]])
-        self._segments, self._indices = first, (key[first] % vertex_count)
-        self._pointers = np.searchsorted(key[first] // vertex_count, np.arange(vertex_count + 1))
+        both = [(k, *pair) for k, (i, j) in enumerate(CORNER_PAIRS) for pair in sorted({(i, j), (j, i)})]
+        entry = np.concatenate([len(CORNER_PAIRS) * np.arange(len(hit)) + k for k, _, _ in both])
+        key = np.concatenate(
+            [self.corners[:, i].astype(np.int64) * vertex_count + self.corners[:, j] for _, i, j in both]
+        )
+        order = np.argsort(key, kind="stable")
+        key, self._entry = key[order], entry[order]
+        self._segments = np.flatnonzero(np.r_[True, key[1:] != key[:-1]])
+        row, column = np.divmod(key[self._segments], vertex_count)
+        pointers = np.searchsorted(row, np.arange(vertex_count + 1))
+        self._pointers, self._indices = (torch.from_numpy(x.astype(np.int32)) for x in (pointers, column))
 
     def matrix(self, pair_sums: np.ndarray) -> Tensor:
         """Symmetric CSR [V, V] from sums [T, 6] of weighted products of barycentrics, by CORNER_PAIRS."""
-        values = np.concatenate(
-            [
-                np.concatenate([pair_sums[:, k], pair_sums[:, k] * (i != j)])
-                for k, (i, j) in enumerate(CORNER_PAIRS)
-            ]
-        )
-        data = np.add.reduceat(values[self._order], self._segments) if len(values) else values
+        values = pair_sums.reshape(-1)[self._entry]
+        data = np.add.reduceat(values, self._segments) if len(values) else values
         shape = (self.vertex_count, self.vertex_count)
-        return to_torch(scipy.sparse.csr_matrix((data, self._indices, self._pointers), shape))
+        parts = (self._pointers, self._indices, torch.from_numpy(data.astype(np.float32)))
+        return torch.sparse_csr_tensor(*parts, shape, check_invariants=False)
 
     def vector(self, corner_sums: np.ndarray) -> np.ndarray:
         """Vertex sums [V, C] from triangle corner sums [T, 3, C]."""
@@ -124,6 +121,24 @@ class NormalEquations:
         return block
 
 
+def pairs_of(corner: np.ndarray) -> np.ndarray:
+    """Products of barycentrics [N, 3] by CORNER_PAIRS, [N, 6]."""
+    return np.stack([corner[:, i] * corner[:, j] for i, j in CORNER_PAIRS], axis=1)
+
+
+def add_products(sums: np.ndarray, ids: np.ndarray, left: np.ndarray, right: np.ndarray) -> None:
+    """Add to ``sums`` [T, L, R] the products of ``left`` [N, L] and ``right`` [N, R] of each sample, whose
+    ``ids`` [N] ascend."""
+    first = np.r_[True, ids[1:] != ids[:-1]]
+    count, width = left.shape
+    column = width * (np.cumsum(first) - 1)[:, None] + np.arange(width)
+    by_id = scipy.sparse.csr_array(
+        (left.ravel(), column.ravel(), np.arange(0, count * width + 1, width)),
+        shape=(count, width * int(first.sum())),
+    )
+    sums[ids[first]] += (by_id.T @ right).reshape(-1, *sums.shape[1:])
+
+
 def assemble(
     samples: Samples,
     pattern: MeshPattern,
@@ -136,22 +151,20 @@ def assemble(
     """Linearise at vertex ``materials`` [V, 4] and ``shared``, and sum over the samples; G is 0 unless
     ``bordered``."""
     count, globals_count = len(pattern.corners), len(shared.vector) if bordered else 0
-    pair_sums = np.zeros((7, count, len(CORNER_PAIRS)), np.float32)
+    pair_sums = np.zeros((count, len(CORNER_PAIRS), 7), np.float32)
     corner_sums = np.zeros((count, 3, CHANNELS * (1 + globals_count)), np.float32)
     normal, right = np.zeros((globals_count,) * 2), np.zeros(globals_count)
     for start, part in zip(range(0, len(samples), CHUNK), samples.chunks(CHUNK), strict=True):
         model = linearise(part, at_pixels(part, triangles, materials), shared)
         residual = Residual.of(part, model.predicted, width)
         ids = pattern.compact[start : start + len(part)]
-        starts = np.flatnonzero(np.r_[True, ids[1:] != ids[:-1]])
-        pairs = torch.stack([part.barycentric[:, i] * part.barycentric[:, j] for i, j in CORNER_PAIRS], dim=1)
+        corner = part.barycentric.numpy()
         weighted_color = residual.weight * model.by_color
         weighted_roughness = residual.weight * model.by_roughness
         products = [weighted_color[:, c] * model.by_color[:, c] for c in range(3)]
         products += [weighted_color[:, c] * model.by_roughness[:, c] for c in range(3)]
         products.append((weighted_roughness * model.by_roughness).sum(dim=1))
-        for k, product in enumerate(products):
-            pair_sums[k][ids[starts]] += np.add.reduceat((pairs * product[:, None]).numpy(), starts, axis=0)
+        add_products(pair_sums, ids, pairs_of(corner), torch.stack(products, dim=1).numpy())
         slopes = model.by_globals[..., :globals_count]
         against = torch.cat([residual.error[..., None], slopes], dim=2)
         channels = torch.cat(
@@ -161,15 +174,13 @@ def assemble(
             ],
             dim=1,
         ).flatten(1)
-        for corner in range(3):
-            terms = (channels * part.barycentric[:, corner, None]).numpy()
-            corner_sums[:, corner][ids[starts]] += np.add.reduceat(terms, starts, axis=0)
+        add_products(corner_sums, ids, corner, channels.numpy())
         slopes = slopes.flatten(0, 1)
         weighted = (slopes * residual.weight.reshape(-1, 1)).T
         normal += (weighted @ slopes).double().numpy()
         right += (weighted @ residual.error.reshape(-1)).double().numpy()
     vertex = pattern.vector(corner_sums).astype(np.float32)
-    matrices = [pattern.matrix(sums) for sums in pair_sums]
+    matrices = [pattern.matrix(pair_sums[:, :, k]) for k in range(7)]
     return NormalEquations(
         color=matrices[:3],
         mixed=matrices[3:6],

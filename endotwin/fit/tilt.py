@@ -16,7 +16,7 @@ from torch import Tensor
 from endotwin.effects import Effects
 from endotwin.fit.gauss_newton import HUBER, TEMPER, GaussNewton, State, conjugate_gradients
 from endotwin.fit.model import at_pixels, predict
-from endotwin.fit.normal import CHUNK, CORNER_PAIRS, MeshPattern, Residual
+from endotwin.fit.normal import CHUNK, MeshPattern, Residual, add_products, pairs_of
 from endotwin.fit.samples import Samples
 from endotwin.guides import guided
 from endotwin.incidence import COS_MIN, dot, unit
@@ -39,7 +39,7 @@ def tilted(
     noise = solver.noise(state)
     scale = 1 / (noise**2 * TEMPER)
     sums, right = _assembled(normals, samples, pattern, solver.triangles, state, twin, effects, HUBER * noise)
-    blocks = {pair: pattern.matrix(sums[:, k] * scale) for k, pair in enumerate(AXIS_PAIRS)}
+    blocks = {pair: pattern.matrix(sums[:, :, k] * scale) for k, pair in enumerate(AXIS_PAIRS)}
     blocks |= {(j, i): block for (i, j), block in blocks.items()}
     precision = 1 / np.radians(SPREAD_DEG) ** 2
 
@@ -68,7 +68,7 @@ def _assembled(
     """Sums over the samples of each triangle, by the tilt of its corners along the world's axes.
 
     Returns:
-        JᵀWJ float32 [T, 6, 6] by AXIS_PAIRS and CORNER_PAIRS; JᵀWe float32 [T, 3, 3] by corner and axis.
+        JᵀWJ float32 [T, 6, 6] by CORNER_PAIRS and AXIS_PAIRS; JᵀWe float32 [T, 3, 3] by corner and axis.
     """
     count = len(pattern.corners)
     sums, right = np.zeros((count, 6, 6), np.float32), np.zeros((count, 3, 3), np.float32)
@@ -94,14 +94,10 @@ def _assembled(
         pull = (residual.weight * slope * residual.error).sum(dim=1).numpy()
         axis = np.einsum("nb,nab->na", axis, rotation)
         ids = pattern.compact[start : start + len(part)]
-        starts = np.flatnonzero(np.r_[True, ids[1:] != ids[:-1]])
         corner = part.barycentric.numpy()
-        pairs = np.stack([corner[:, i] * corner[:, j] for i, j in CORNER_PAIRS], axis=1) * weight[:, None]
-        for k, (i, j) in enumerate(AXIS_PAIRS):
-            along = pairs * (axis[:, i] * axis[:, j])[:, None]
-            sums[ids[starts], k] += np.add.reduceat(along, starts, axis=0)
-        pulls = (corner * pull[:, None])[:, :, None] * axis[:, None]
-        right[ids[starts]] += np.add.reduceat(pulls, starts, axis=0)
+        along = np.stack([weight * axis[:, i] * axis[:, j] for i, j in AXIS_PAIRS], axis=1)
+        add_products(sums, ids, pairs_of(corner), along)
+        add_products(right, ids, corner, pull[:, None] * axis)
     return sums, right
 
 
