@@ -26,6 +26,9 @@ from endotwin.twin import Light, Twin
 ORDER = ("offset", "interreflection", "gain", "profile", "vignetting")
 """Effects that are tried, each beside those already kept; the strongest first."""
 
+SEARCH_PIXELS = 8_000
+"""Guides are sought with so many pixels of the probe, and polished with all."""
+
 MIN_GAIN_BESIDE_BOUNCE_DB = 0.5
 """Bounced light is known by patches only: gain or profile could mend by 0.2 dB what that lacks."""
 
@@ -186,7 +189,8 @@ class _Trial:
     def _adopt_offset(self, forced: bool) -> None:
         hypothesis = self._kept.hypothesis
         base, best = self._vignetted(hypothesis), None
-        search = Search(self._probe, base)
+        probe = self._probe
+        search = Search(Probe(probe.samples, probe.twin, probe.caster, SEARCH_PIXELS), base)
         for number in range(1, MOST_GUIDES + 1):
             found = self._probe.fit(search.best(number, best))
             if (best is None and forced and number == 2) or self._probe.compare(best or base, found).keep:
@@ -196,7 +200,8 @@ class _Trial:
         if best is None:
             self._decide("offset", "off", "no position of one to three guides predicts better", None)
             return
-        best = self._probe.fit(replace(best.hypothesis, vignetting=hypothesis.vignetting))
+        polished = Search(probe, best).polished()
+        best = probe.fit(replace(polished, vignetting=hypothesis.vignetting))
         verdict = self._probe.compare(self._kept, best)
         unshadowed = self._probe.fit(replace(best.hypothesis, shadows=False))
         shadow = self._probe.compare(unshadowed, best)

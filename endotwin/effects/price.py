@@ -30,7 +30,6 @@ def priced(twin: Twin, caster: Caster) -> Twin:
     dear = [name for name in twin.effects if name in decisions and name not in FREE]
     if dear:
         whole = Renderer(twin, caster=caster)
-        whole.view(_middle_pose(twin))
         whole_ms = frame_ms(whole)
         for name in dear:
             gone = {"offset": ("offset", "shadows")}.get(name, (name,))

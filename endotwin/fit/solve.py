@@ -49,9 +49,9 @@ LIGHT_COARSEST_MM = 12.0
 """Cells of the features beside which light and response are found, in units of the scene."""
 
 LIGHT_PIXELS, LIGHT_STEPS = 400_000, 6
-HOLD_STEPS, RELIGHT_STEPS = 1, 9
-"""Steps where the light depends on the materials and is renewed at each; before HOLD_STEPS the albedo's
-scale is held."""
+HOLD_STEPS, BOUNCE_STEPS = 1, 9
+"""Steps where light is bounced, and depends on the materials; before HOLD_STEPS the albedo's scale is
+held."""
 
 COAT_STEP = 2
 """A coat that nobody asked for is judged when light and materials are near."""
@@ -197,7 +197,7 @@ def _find_light(
     ready = pace.stopwatch.total
     state, _ = solver.step(state, joint=False)
     step_s = pace.stopwatch.total - ready
-    steps = RELIGHT_STEPS if relighting.needed else LIGHT_STEPS
+    steps = BOUNCE_STEPS if relighting.bounces else LIGHT_STEPS
     judged = Decision("off", "no time to judge")
     for number in range(steps):
         late = pace.left(LIGHT) <= 2 * step_s
