@@ -116,15 +116,14 @@ def fit_twin(twin: Twin, pace: Pace, seed: int, states: Mapping[str, str]) -> Tw
                     "no training photo of %s has an unclipped pixel: its light and materials are guesses",
                     twin.source.path,
                 )
-        telling = torch.from_numpy(
-            telling[drawn(len(telling), pace.start_pixels, np.random.default_rng(seed))]
-        )
+        every = torch.from_numpy(telling)
+        telling = every[drawn(len(every), pace.start_pixels, np.random.default_rng(seed))]
         start = closed_form(samples[telling], surface.triangles, len(surface.vertices_mm))
     if start.undetermined:
         logger.warning("the photos cannot tell %s: kept at the prior", " and ".join(start.undetermined))
     with stopwatch.stage("effects"):
         caster = caster.threaded(THREADS)
-        decided = decide(samples[telling], twin, caster, states)
+        decided = decide(samples[every], twin, caster, states)
         relighting = Relighting(twin, caster, decided.effects, np.unique(samples.frame.numpy()))
         if decided.light is not None:
             start = start_at(
