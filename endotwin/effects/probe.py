@@ -39,6 +39,9 @@ MIN_SIGMAS = 4.0
 uncertainties. Of the scenes that were tried, those without an effect show at most 0.19 dB of it, 0.04 dB
 where no light is bounced; those that have it at least 0.57 dB."""
 
+POSSIBLE = ((0.1, 2.0), (-1.0, 12.0), (-0.5, 7.0))
+"""Bounds of γ, n and q, with room for their errors: beyond, few pixels were explained by many things."""
+
 HINT_DB, HINT_SIGMAS = 0.1, 2.0
 """What is worth a longer look, which then has to be worth keeping."""
 
@@ -72,21 +75,24 @@ class Hypothesis:
 
 @dataclass(frozen=True)
 class Verdict:
-    """By how much one hypothesis predicts unseen pixels better than another: dB, and in its own sigmas."""
+    """By how much one hypothesis predicts unseen pixels better than another: dB, and in its own sigmas; and
+    whether light and response of the better one are any endoscope's."""
 
     gain_db: float
     sigmas: float
+    possible: bool = True
 
     @property
     def keep(self) -> bool:
-        return self.gain_db >= MIN_GAIN_DB and self.sigmas >= MIN_SIGMAS
+        return self.possible and self.gain_db >= MIN_GAIN_DB and self.sigmas >= MIN_SIGMAS
 
     @property
     def hints(self) -> bool:
         return self.gain_db >= HINT_DB and self.sigmas >= HINT_SIGMAS
 
     def __str__(self) -> str:
-        return f"{self.gain_db:+.2f} dB, {self.sigmas:.0f} sigmas"
+        impossible = "" if self.possible else ", but with a light that no endoscope has"
+        return f"{self.gain_db:+.2f} dB, {self.sigmas:.0f} sigmas{impossible}"
 
 
 @dataclass(frozen=True)
@@ -113,6 +119,12 @@ class Fitted:
     @property
     def q(self) -> float:
         return float(self.effects.coefficients[1] / self.effects.coefficients[2])
+
+    @property
+    def possible(self) -> bool:
+        """Whether γ, n and q are such as an endoscope may have."""
+        told = (self.gamma, self.n, self.q)
+        return all(low < value < high for value, (low, high) in zip(told, POSSIBLE, strict=True))
 
 
 class Probe:
@@ -224,7 +236,8 @@ class Probe:
     def compare(self, base: Fitted, other: Fitted) -> Verdict:
         """How much better ``other`` predicts pixels of vertices that did not choose its coefficients."""
         designs = base.design, other.design
-        return compared(self.target, *designs, self._half, base.effects.width, len(self.frames))
+        verdict = compared(self.target, *designs, self._half, base.effects.width, len(self.frames))
+        return replace(verdict, possible=other.possible)
 
     def _fitted(self, hypothesis: Hypothesis, design: Design) -> Fitted:
         return Fitted(hypothesis, design, regress(self.target, design, len(self.frames)))

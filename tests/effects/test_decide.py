@@ -11,6 +11,7 @@ import torch
 from endotwin.casting import Caster
 from endotwin.config import STANDARD
 from endotwin.effects.decide import decide
+from endotwin.effects.probe import Hypothesis, Probe
 from endotwin.effects.vignetting import Vignetting
 from endotwin.fit.pace import Pace
 from endotwin.fit.samples import gather
@@ -62,6 +63,16 @@ def test_gain_is_found_to_a_hundredth(example):
     gain = decided.effects["gain"]
     true = log_gain[list(gain.frames)]
     assert np.abs(np.array(gain.log_gain) - (true - true.mean())).max() < 0.02
+
+
+def test_an_effect_is_not_kept_beside_a_light_that_no_endoscope_has(example):
+    twin, caster, samples = example
+    log_gain = np.random.default_rng(3).normal(0, 0.15, 64)
+    probe = Probe(brightened(samples, log_gain), twin, caster)
+    plain, gained = probe.fit(Hypothesis()), probe.fit(Hypothesis(gain=True))
+    assert probe.compare(plain, gained).keep
+    towards_the_sides = replace(gained.effects, coefficients=gained.effects.coefficients * [-1, 1, 1])
+    assert not probe.compare(plain, replace(gained, effects=towards_the_sides)).keep
 
 
 def test_a_profile_that_is_no_cosine_is_found(example):
