@@ -17,7 +17,7 @@ from endotwin.fit.model import GLOBALS, Globals
 from endotwin.fit.within import DIFFUSE_SIN2, LEAST_SIGHTINGS, Within
 
 ROUGHNESSES = (0.06, 0.09, 0.13, 0.19, 0.27)
-PIXELS = 60_000
+PIXELS = 30_000
 """Of the highlights, all of some vertices; more would not change the mind."""
 
 SEARCH_ROUNDS = 2
