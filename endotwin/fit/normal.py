@@ -21,6 +21,10 @@ CHANNELS = 4
 """Base colour red, green, blue; roughness."""
 
 CORNER_PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
+HIGHLIGHT_SIN2 = 0.15
+"""Beside bounced light, pixels farther than asin √0.15 ≈ 23° from the mirror direction tell no roughness: it
+is known by patches only, and errs by more than the little that roughness does to Burley's diffuse lobe."""
+
 CHUNK = 1 << 18
 CLIPPED = 255
 
@@ -159,11 +163,14 @@ def assemble(
         residual = Residual.of(part, model.predicted, width)
         ids = pattern.compact[start : start + len(part)]
         corner = part.barycentric.numpy()
+        by_roughness = model.by_roughness
+        if part.bounce is not None:
+            by_roughness = torch.where(part.sin2[:, None] < HIGHLIGHT_SIN2, by_roughness, 0)
         weighted_color = residual.weight * model.by_color
-        weighted_roughness = residual.weight * model.by_roughness
+        weighted_roughness = residual.weight * by_roughness
         products = [weighted_color[:, c] * model.by_color[:, c] for c in range(3)]
-        products += [weighted_color[:, c] * model.by_roughness[:, c] for c in range(3)]
-        products.append((weighted_roughness * model.by_roughness).sum(dim=1))
+        products += [weighted_color[:, c] * by_roughness[:, c] for c in range(3)]
+        products.append((weighted_roughness * by_roughness).sum(dim=1))
         add_products(pair_sums, ids, pairs_of(corner), torch.stack(products, dim=1).numpy())
         slopes = model.by_globals[..., :globals_count]
         against = torch.cat([residual.error[..., None], slopes], dim=2)
