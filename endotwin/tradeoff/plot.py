@@ -68,7 +68,7 @@ def draw(rows: list[dict], files: list[Path]) -> None:
         keys = [
             Line2D([], [], color=color, marker="o", ls="", ms=5, label=knob) for knob, color in colors.items()
         ]
-        first.legend(handles=keys, fontsize=7.5, frameon=False, loc="lower right", handletextpad=0.1)
+        first.legend(handles=keys, fontsize=7.5, frameon=False, loc="best", handletextpad=0.1)
         _scatter(figure.add_subplot(grid[0, 1]), rows, "ssim", "SSIM", best, colors)
         bars = figure.add_subplot(grid[1, :])
         _bars(bars, rows, best)
