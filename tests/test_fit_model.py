@@ -9,8 +9,9 @@ import torch
 from endotwin.effects.coat import Coat
 from endotwin.fit.gauss_newton import _joint_minimum, conjugate_gradients
 from endotwin.fit.model import BOUNCE_GLOBALS, Globals, at_pixels, linearise, predict
-from endotwin.fit.normal import HIGHLIGHT_SIN2, MeshPattern, Residual, assemble, robust_cost
+from endotwin.fit.normal import MeshPattern, Residual, assemble, robust_cost
 from endotwin.fit.samples import Bounce, Samples, discontinuities
+from endotwin.fit.start import DIFFUSE_SIN2
 from endotwin.guides import Guided
 from endotwin.twin import Light, Response
 
@@ -269,7 +270,7 @@ def test_assembling_in_chunks_changes_nothing(equations, dense, triangles, monke
     close(again.roughness.to_dense().numpy(), equations.roughness.to_dense().numpy())
 
 
-@pytest.mark.parametrize("sin2", [HIGHLIGHT_SIN2 - 0.01, HIGHLIGHT_SIN2 + 0.01])
+@pytest.mark.parametrize("sin2", [DIFFUSE_SIN2 - 0.01, DIFFUSE_SIN2 + 0.01])
 def test_beside_bounced_light_only_highlights_tell_roughness(dense, triangles, sin2):
     samples = replace(dense[0], sin2=torch.full_like(dense[0].sin2, sin2))
     bounce = Bounce(*(x.float() for x in vars(in_a_tube(samples).bounce).values()))
@@ -279,7 +280,7 @@ def test_beside_bounced_light_only_highlights_tell_roughness(dense, triangles, s
         samples, pattern, torch.from_numpy(triangles), dense[1].float(), BOUNCE_SHARED, WIDTH
     )
     told = bool(equations.roughness.to_dense().any()), bool(equations.right[:, 3].any())
-    assert told == (sin2 < HIGHLIGHT_SIN2,) * 2
+    assert told == (sin2 < DIFFUSE_SIN2,) * 2
     assert equations.color[0].to_dense().any()
 
 

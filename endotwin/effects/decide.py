@@ -188,12 +188,11 @@ class _Trial:
 
     def _adopt_offset(self, forced: bool) -> None:
         hypothesis = self._kept.hypothesis
-        base, best = self._vignetted(hypothesis), None
-        probe = self._probe
+        probe, base, best = self._probe, self._vignetted(hypothesis), None
         search = Search(Probe(probe.samples, probe.twin, probe.caster, SEARCH_PIXELS), base)
         for number in range(1, MOST_GUIDES + 1):
-            found = self._probe.fit(search.best(number, best))
-            if (best is None and forced and number == 2) or self._probe.compare(best or base, found).keep:
+            found = probe.fit(search.best(number, best))
+            if (best is None and forced and number == 2) or probe.compare(best or base, found).keep:
                 best = found
             elif number > 1:
                 break
@@ -202,9 +201,9 @@ class _Trial:
             return
         polished = Search(probe, best).polished()
         best = probe.fit(replace(polished, vignetting=hypothesis.vignetting))
-        verdict = self._probe.compare(self._kept, best)
-        unshadowed = self._probe.fit(replace(best.hypothesis, shadows=False))
-        shadow = self._probe.compare(unshadowed, best)
+        verdict = probe.compare(self._kept, best)
+        unshadowed = probe.fit(replace(best.hypothesis, shadows=False))
+        shadow = probe.compare(unshadowed, best)
         shadows = self.wanted("shadows") == "on" or (self.wanted("shadows") == "auto" and shadow.keep)
         self._kept = best if shadows else unshadowed
         self._decide("offset", "on", _reason(verdict, self.wanted("offset")), verdict)

@@ -17,7 +17,7 @@ import numpy as np
 import torch
 
 from endotwin.fit.fixed_effects import Design, FixedEffects, regress, robust_losses
-from endotwin.fit.start import BRIGHT, COS_MIN, DARK, HIGHLIGHT_SIN2, PRIOR
+from endotwin.fit.start import PRIOR, diffuse
 from endotwin.guides import AT_LENS, COSINE, guided, log_axis, visible_from
 from endotwin.incidence import unit
 
@@ -138,10 +138,7 @@ class Probe:
         surface = twin.surface
         self.twin, self.caster = twin, caster
         generator = np.random.default_rng(seed)
-        darkest, brightest = (x.numpy() for x in samples.color.aminmax(dim=1))
-        usable = (brightest < BRIGHT) & (darkest > DARK)
-        usable &= (samples.cos.numpy() > COS_MIN) & (samples.sin2.numpy() > HIGHLIGHT_SIN2)
-        rows = np.flatnonzero(usable)
+        rows = np.flatnonzero(diffuse(samples))
         corner = samples.barycentric.argmax(dim=1).numpy()[rows]
         vertex = surface.triangles[samples.triangle.numpy()[rows], corner]
         chosen = _whole_groups(vertex, len(surface.vertices_mm), pixels, generator)

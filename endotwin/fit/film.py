@@ -14,7 +14,8 @@ from endotwin.effects.coat import Coat
 from endotwin.effects.probe import Verdict, compared
 from endotwin.fit.fixed_effects import Design, regress, robust_losses
 from endotwin.fit.model import GLOBALS, Globals
-from endotwin.fit.within import DIFFUSE_SIN2, LEAST_SIGHTINGS, Within
+from endotwin.fit.start import DIFFUSE_SIN2
+from endotwin.fit.within import LEAST_SIGHTINGS, Within
 
 ROUGHNESSES = (0.06, 0.09, 0.13, 0.19, 0.27)
 PIXELS = 30_000

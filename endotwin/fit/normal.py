@@ -16,15 +16,12 @@ from torch import Tensor
 
 from endotwin.fit.model import Globals, at_pixels, linearise
 from endotwin.fit.samples import Samples
+from endotwin.fit.start import DIFFUSE_SIN2
 
 CHANNELS = 4
 """Base colour red, green, blue; roughness."""
 
 CORNER_PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
-HIGHLIGHT_SIN2 = 0.15
-"""Beside bounced light, pixels farther than asin √0.15 ≈ 23° from the mirror direction tell no roughness: it
-is known by patches only, and errs by more than the little that roughness does to Burley's diffuse lobe."""
-
 CHUNK = 1 << 18
 CLIPPED = 255
 
@@ -153,7 +150,11 @@ def assemble(
     bordered: bool = True,
 ) -> NormalEquations:
     """Linearise at vertex ``materials`` [V, 4] and ``shared``, and sum over the samples; G is 0 unless
-    ``bordered``."""
+    ``bordered``.
+
+    Beside bounced light, pixels beyond DIFFUSE_SIN2 tell no roughness: it is known by patches only, and errs
+    by more than the little that roughness does to Burley's diffuse lobe.
+    """
     count, globals_count = len(pattern.corners), len(shared.vector) if bordered else 0
     pair_sums = np.zeros((count, len(CORNER_PAIRS), 7), np.float32)
     corner_sums = np.zeros((count, 3, CHANNELS * (1 + globals_count)), np.float32)
@@ -165,7 +166,7 @@ def assemble(
         corner = part.barycentric.numpy()
         by_roughness = model.by_roughness
         if part.bounce is not None:
-            by_roughness = torch.where(part.sin2[:, None] < HIGHLIGHT_SIN2, by_roughness, 0)
+            by_roughness = torch.where(part.sin2[:, None] < DIFFUSE_SIN2, by_roughness, 0)
         weighted_color = residual.weight * model.by_color
         weighted_roughness = residual.weight * by_roughness
         products = [weighted_color[:, c] * model.by_color[:, c] for c in range(3)]

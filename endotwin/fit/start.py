@@ -27,6 +27,9 @@ BRIGHT, DARK = 250, 5
 HIGHLIGHT_SIN2 = 0.06
 """Nearer than asin √0.06 ≈ 14° to the mirror direction a highlight may be what is seen."""
 
+DIFFUSE_SIN2 = 0.15
+"""Farther than asin √0.15 ≈ 23° from the mirror direction a rough highlight has faded, too."""
+
 COS_MIN = 0.1
 ROUNDS = 6
 LEAST_TOLD = 0.015
@@ -92,13 +95,18 @@ def _start(
     )
 
 
+def diffuse(samples: Samples) -> np.ndarray:
+    """Bool [N]: samples of which a diffuse model tells all: well exposed, off the highlights, not grazing."""
+    darkest, brightest = (x.numpy() for x in samples.color.aminmax(dim=1))
+    exposed = (brightest < BRIGHT) & (darkest > DARK)
+    return exposed & (samples.cos.numpy() > COS_MIN) & (samples.sin2.numpy() > HIGHLIGHT_SIN2)
+
+
 def _coefficients(
     samples: Samples, vertex: np.ndarray, count: int
 ) -> tuple[float, float, float, tuple[str, ...]]:
     color = samples.color.numpy()
-    darkest, brightest = (x.numpy() for x in samples.color.aminmax(dim=1))
-    use = (brightest < BRIGHT) & (darkest > DARK)
-    use &= (samples.cos.numpy() > COS_MIN) & (samples.sin2.numpy() > HIGHLIGHT_SIN2)
+    use = diffuse(samples)
     target = np.log(np.maximum(color, 1).mean(axis=1, dtype=np.float64) / 255)
     columns = [x.numpy() for x in (samples.log_cos_axis, -samples.log_distance, samples.cos.log())]
     values = np.stack([*columns, target], axis=1).astype(np.float64)[use]

@@ -20,11 +20,8 @@ from endotwin.fit.fixed_effects import Design, regress
 from endotwin.fit.gauss_newton import TEMPER, bounded, free_directions, global_prior
 from endotwin.fit.model import Globals, linearise
 from endotwin.fit.samples import Samples
-from endotwin.fit.start import BRIGHT
+from endotwin.fit.start import BRIGHT, DIFFUSE_SIN2
 from endotwin.surface import Surface
-
-DIFFUSE_SIN2 = 0.15
-"""Farther than asin √0.15 ≈ 23° from the mirror direction a rough highlight has faded, too."""
 
 DARKEST = 0.03
 """Display value of the prediction below which noise rules the logarithm."""
