@@ -13,6 +13,7 @@ from functools import cached_property
 
 import numpy as np
 import scipy.sparse
+import torch
 from scipy.spatial import cKDTree
 
 from endotwin.casting import Caster
@@ -73,7 +74,7 @@ class Radiosity:
         normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         double_area = np.sqrt(dot(normal, normal))
         normal = normal / np.maximum(double_area, np.finfo(np.float32).tiny)[:, None]
-        self.patch_of = _patches(corners.mean(axis=1), normal, cell_mm)
+        self.patch_of = _patches(np.einsum("nka->na", corners) / 3, normal, cell_mm)
         self.count = int(self.patch_of.max()) + 1
         self._area = double_area / 2
         self._draw = _Draw(self.patch_of, double_area, self.count)
@@ -178,7 +179,7 @@ class _Draw:
     """Draws triangles of each patch by area, stratified."""
 
     def __init__(self, patch_of: np.ndarray, area: np.ndarray, count: int):
-        self._order = np.argsort(patch_of, kind="stable")
+        self._order = _grouped(patch_of, count)
         self._cumulated = np.cumsum(area[self._order], dtype=np.float64)
         ends = np.searchsorted(patch_of[self._order], np.arange(count), side="right")
         self._high = self._cumulated[ends - 1]
@@ -192,6 +193,12 @@ class _Draw:
         return self._order[np.minimum(found, len(self._order) - 1)]
 
 
+def _grouped(group: np.ndarray, count: int) -> np.ndarray:
+    """Stable order of members by ``group`` [N], int [N]: a counting sort."""
+    members = np.arange(len(group))
+    return scipy.sparse.csr_array((members, (group, members)), shape=(count, len(group))).data
+
+
 def _patches(centre_mm: np.ndarray, normal: np.ndarray, cell_mm: float) -> np.ndarray:
     """Patch of each triangle: cells of edge ``cell_mm``, split by the axis that the triangle faces most."""
     axis = np.abs(normal).argmax(axis=1)
@@ -201,7 +208,7 @@ def _patches(centre_mm: np.ndarray, normal: np.ndarray, cell_mm: float) -> np.nd
     x, y, z = cell.T
     width, height, _ = cell.max(axis=0) + 1
     key = ((z * height + y) * width + x) * 6 + facing
-    return np.unique(key, return_inverse=True)[1].reshape(-1)
+    return torch.unique(torch.from_numpy(key), return_inverse=True)[1].numpy()
 
 
 def _inside(corners: np.ndarray, generator: np.random.Generator) -> np.ndarray:

@@ -115,20 +115,22 @@ class Within:
 
         What varies among the pixels of a sighting is where about the vertex they lie: texture, not light.
         """
-        color = self.samples.color.double()
-        usable = chosen & (color.max(dim=1).values < BRIGHT) & (color.mean(dim=1) > 0)
-        rows = torch.nonzero(usable)[:, 0]
+        rows = torch.nonzero(chosen)[:, 0]
+        color = self.samples.color[rows]
+        shown = color.double().mean(dim=1)
+        usable = (color.amax(dim=1) < BRIGHT) & (shown > 0)
+        rows, shown = rows[usable], shown[usable]
         model = linearise(self.samples[rows], material[rows], shared)
         floor = math.exp(shared.gamma * math.log(shading.RADIANCE_MIN))
         predicted = model.predicted.double().mean(dim=1)
         bright = predicted > DARKEST
-        rows, shown = rows[bright], (predicted[bright] + floor).numpy()
-        residual = np.log(color[rows].mean(dim=1).numpy() / 255 + floor) - np.log(shown)
-        slopes = model.by_globals[bright].double().mean(dim=1).numpy() / shown[:, None]
-        by_coat = np.zeros(len(shown))
+        rows, shown, predicted = rows[bright], shown[bright].numpy(), (predicted[bright] + floor).numpy()
+        residual = np.log(shown / 255 + floor) - np.log(predicted)
+        slopes = model.by_globals[bright].double().mean(dim=1).numpy() / predicted[:, None]
+        by_coat = np.zeros(len(predicted))
         if model.by_coat is not None:
-            by_coat = model.by_coat[bright].double().mean(dim=1).numpy() / shown
-        weight = 1 / ((noise / shown) ** 2 + MODEL_ERROR**2)
+            by_coat = model.by_coat[bright].double().mean(dim=1).numpy() / predicted
+        weight = 1 / ((noise / predicted) ** 2 + MODEL_ERROR**2)
         place = self.vertex[rows.numpy()].astype(np.int64) << 32 | self.samples.frame[rows].numpy()
         place, which = np.unique(place, return_inverse=True)
         total = np.bincount(which, weight, len(place))
