@@ -127,9 +127,8 @@ class Renderer:
         shape = (self.camera.height, self.camera.width)
         light = self._illumination.at(T_world_camera)
         hits, normals, radiance, visible = self._cast(self.camera, light, T_world_camera, mask)
-        z = self.camera.pixel_directions.reshape(-1, 3)[:, 2].take(hits.pixel)
         radiance = laid_out(radiance, hits.pixel, shape)
-        edges = discontinuities(laid_out(hits.distance_mm * z, hits.pixel, shape, np.nan))
+        edges = discontinuities(laid_out(hits.distance_mm, hits.pixel, shape))
         if visible is not None:
             edges |= shadow_edges(laid_out(visible, hits.pixel, shape))
         edges &= self._sees if mask is None else mask

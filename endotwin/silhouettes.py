@@ -10,9 +10,9 @@ JUMP = 0.1
 
 
 def discontinuities(depth_mm: np.ndarray) -> np.ndarray:
-    """Bool [H, W]: pixels next to a jump of depth float32 [H, W], or to a pixel without one (NaN)."""
+    """Bool [H, W]: pixels beside a jump of depth (or of distance) float32 [H, W], or where it ends (NaN
+    or 0)."""
     kernel = np.ones((3, 3), np.uint8)
-    known = np.isfinite(depth_mm)
-    farthest = cv2.dilate(np.where(known, depth_mm, np.inf).astype(np.float32), kernel)
-    nearest = cv2.erode(np.where(known, depth_mm, np.float32(0)).astype(np.float32), kernel)
-    return ~(farthest - nearest <= JUMP * depth_mm)
+    depth_mm = np.nan_to_num(depth_mm, posinf=0)
+    farthest, nearest = cv2.dilate(depth_mm, kernel), cv2.erode(depth_mm, kernel)
+    return (farthest > 0) & ~(farthest - nearest <= JUMP * depth_mm)

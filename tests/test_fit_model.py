@@ -336,3 +336,12 @@ def test_pixels_beside_a_jump_of_depth_or_a_hole_are_discontinuities():
     expected[:, 5:7] = True
     expected[:3, :3] = True
     np.testing.assert_array_equal(discontinuities(depth_mm), expected)
+
+
+def test_of_pixels_without_depth_only_those_beside_some_are_discontinuities():
+    depth_mm = np.full((9, 12), np.nan, np.float32)
+    depth_mm[:, 8:] = 20
+    expected = np.zeros((9, 12), bool)
+    expected[:, 7:9] = True
+    np.testing.assert_array_equal(discontinuities(depth_mm), expected)
+    np.testing.assert_array_equal(discontinuities(np.nan_to_num(depth_mm)), expected)
