@@ -130,6 +130,22 @@ def test_a_slit_narrower_than_a_pixel_is_no_black_line(plane):
     np.testing.assert_allclose(view.color[row, column], view.color[row, column + 1], rtol=0.05)
 
 
+@pytest.mark.parametrize(("gap_px", "closed"), [(1, True), (2, True), (3, False)])
+def test_a_gap_of_one_or_two_pixels_is_no_black_line_and_a_wider_one_is(plane, gap_px, closed):
+    row, first = 30, 40
+    slopes = CAMERA.pixel_directions[row, :, 0] / CAMERA.pixel_directions[row, :, 2]
+    left, right = (plane.vertices_mm + plane.origin_mm - CENTRE_MM for _ in range(2))
+    left[left[:, 0] > 0, 0] = PLANE_MM * (slopes[first - 1] + slopes[first]) / 2
+    right[right[:, 0] < 0, 0] = PLANE_MM * (slopes[first + gap_px - 1] + slopes[first + gap_px]) / 2
+    triangles = np.concatenate([plane.triangles, plane.triangles + 4])
+    vertices = np.concatenate([left, right]) + CENTRE_MM
+    gap = Surface.from_mesh(vertices, triangles, np.tile([0, 0, -1.0], (8, 1)))
+    view = Renderer(twin_of(gap)).view(at_centre())
+    within = slice(first, first + gap_px)
+    assert not view.mask[row, within].any() and np.isnan(view.depth_mm[row, within]).all()
+    assert view.color[row, within].any(axis=-1).all() == closed
+
+
 def test_a_mask_limits_the_view_and_changes_nothing_within(sphere):
     renderer = Renderer(twin_of(sphere))
     whole = renderer.view(at_centre())
