@@ -67,3 +67,27 @@ def test_a_loose_piece_is_not_made_a_bubble(ball):
     aside_mm = np.linalg.norm(vertices_mm[triangles].mean(axis=1) - [0, 0, RADIUS_MM], axis=1)
     piece = surface_of(np.zeros(3), vertices_mm, triangles[aside_mm < 0.5])
     assert filled(CAMERA, piece, [view(np.nan)], TOLERANCE, VOXEL_MM) is piece
+
+
+def test_of_two_holes_that_touch_both_are_closed(ball):
+    vertices_mm, triangles = ball
+    tip = triangles[np.argmax(vertices_mm[triangles][..., 2].min(axis=1))][0]
+    around = np.flatnonzero((triangles == tip).any(axis=1))
+    centre_mm = vertices_mm[triangles[around]].mean(axis=1) - vertices_mm[tip]
+    turn = np.argsort(np.arctan2(centre_mm[:, 1], centre_mm[:, 0]))
+    opposite = around[turn[[0, len(around) // 2]]]
+    surface = surface_of(np.zeros(3), vertices_mm, np.delete(triangles, opposite, axis=0))
+    assert len(boundary_edges(surface.triangles)) == 6
+    assert len(boundary_edges(filled(CAMERA, surface, [view(np.nan)], TOLERANCE, VOXEL_MM).triangles)) == 0
+
+
+def test_a_cap_never_folds_over_the_surface_around_it(ball):
+    vertices_mm, triangles = ball
+    generator = np.random.default_rng(0)
+    corners = vertices_mm[triangles]
+    torn_out = (corners[..., 2].mean(axis=1) > 0) & (generator.random(len(triangles)) < 0.2)
+    before = surface_of(np.zeros(3), vertices_mm, triangles[~torn_out])
+    after = filled(CAMERA, before, [view(np.nan)], TOLERANCE, VOXEL_MM)
+    a, b, c = after.vertices_mm[after.triangles].transpose(1, 0, 2)
+    assert after.filled.any()
+    assert (np.einsum("ta,ta->t", np.cross(b - a, c - a), a + b + c) < 0).all()

@@ -66,10 +66,9 @@ class Agreement:
 
 
 def compare(
-    camera: Camera, surface: Surface, views: Iterable[View], tolerance: Tolerance
+    camera: Camera, caster: Caster, views: Iterable[View], tolerance: Tolerance
 ) -> Iterator[Comparison]:
-    """Each of ``views`` against ``surface``, the next one being cast while this one is used."""
-    caster = Caster(surface)
+    """Each of ``views`` against the caster's surface, the next one being cast while this one is used."""
 
     def against(view: View) -> Comparison:
         measured = view.distance_mm.reshape(-1)
@@ -92,7 +91,7 @@ def measured_noise(camera: Camera, surface: Surface, views: Iterable[View]) -> f
     It is 1.48 · the median absolute residual, so that folds which the surface lacks do not count.
     """
     spreads = []
-    for seen in compare(camera, surface, views, Tolerance(np.inf, 0.0)):
+    for seen in compare(camera, Caster(surface), views, Tolerance(np.inf, 0.0)):
         hit = np.isfinite(seen.residual_mm)
         if hit.any():
             measured_mm = seen.view.distance_mm.reshape(-1)[hit]
@@ -103,7 +102,7 @@ def measured_noise(camera: Camera, surface: Surface, views: Iterable[View]) -> f
 def agreement(camera: Camera, surface: Surface, views: Iterable[View], tolerance: Tolerance) -> Agreement:
     """How well ``surface`` explains every measured pixel of ``views``."""
     tally = np.zeros(4, np.int64)
-    for seen in compare(camera, surface, views, tolerance):
+    for seen in compare(camera, Caster(surface), views, tolerance):
         misses = seen.lacking & (seen.triangle < 0)
         tally += [seen.at.sum(), misses.sum(), (seen.lacking & ~misses).sum(), seen.before.sum()]
     return Agreement(*(tally / max(tally.sum(), 1)).tolist())

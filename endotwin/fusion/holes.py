@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,7 +13,7 @@ from endotwin.ahead import ahead
 from endotwin.cameras import Camera
 from endotwin.fusion.agreement import Tolerance
 from endotwin.fusion.coverage import about
-from endotwin.fusion.mesh import boundary_edges, joined, surface_of
+from endotwin.fusion.mesh import boundary_edges, surface_of
 from endotwin.fusion.smooth import neighbour_mean
 from endotwin.fusion.views import View
 from endotwin.surface import Surface
@@ -53,6 +53,7 @@ def filled(
     triangles = np.concatenate([surface.triangles, caps.triangles])
     vertices_mm[first:] = _faired(vertices_mm, triangles, first)
     sound = _unpierced(camera, surface, vertices_mm[first:], caps.hole, views, tolerance)
+    sound &= _upright(surface, rims, vertices_mm, caps)
     triangles = np.concatenate([surface.triangles, caps.triangles[sound[caps.triangle_hole]]])
     return surface_of(surface.origin_mm, vertices_mm, triangles, np.arange(len(vertices_mm)) >= first)
 
@@ -60,32 +61,45 @@ def filled(
 def _rims(surface: Surface, longest_mm: float) -> list[np.ndarray]:
     """Vertices around each hole with a rim of at most ``longest_mm``, in the direction of its triangles.
 
-    Rims that touch another are left out, and so is the outline of a loose piece: closed, it would be a
-    bubble.
+    The outline of a loose piece is left out: closed, it would be a bubble.
     """
-    edges = boundary_edges(surface.triangles)
-    count = len(surface.vertices_mm)
-    leaving, arriving = (np.bincount(column, minlength=count) for column in edges.T)
-    number = joined(count, edges)
-    spoilt = np.zeros(count, bool)
-    spoilt[number[(leaving != arriving) | (leaving > 1)]] = True
-    step_mm = surface.vertices_mm[edges[:, 1]] - surface.vertices_mm[edges[:, 0]]
-    length_mm = np.bincount(number[edges[:, 0]], np.linalg.norm(step_mm, axis=1), count)
-    edges = edges[~(spoilt | (length_mm > longest_mm))[number[edges[:, 0]]]]
-    following = dict(edges.tolist())
     rims = []
-    while following:
-        start, vertex = following.popitem()
-        rim = [start]
-        while vertex != start:
-            rim.append(vertex)
-            vertex = following.pop(vertex)
-        rim = np.array(rim)
+    for rim in _loops(boundary_edges(surface.triangles)):
         points = surface.vertices_mm[rim]
+        step_mm = np.roll(points, -1, axis=0) - points
         spanned = np.cross(np.roll(points, -1, axis=0) - points[0], points - points[0]).sum(axis=0)
-        if len(rim) > 2 and spanned @ surface.normals[rim].sum(axis=0) > 0:
+        short = np.sqrt((step_mm**2).sum(axis=1)).sum() <= longest_mm
+        if len(rim) > 2 and short and spanned @ surface.normals[rim].sum(axis=0) > 0:
             rims.append(rim)
     return rims
+
+
+def _loops(edges: np.ndarray) -> Iterator[np.ndarray]:
+    """Loops [N] of vertices that directed ``edges`` [E, 2] form. Those that touch are cut there, so that none
+    passes a vertex twice; edges that lead nowhere are left out."""
+    following: dict[int, list[int]] = {}
+    for start, end in edges.tolist():
+        following.setdefault(start, []).append(end)
+    while following:
+        path = [next(iter(following))]
+        place = {path[0]: 0}
+        while path:
+            ways = following.get(path[-1])
+            if ways is None:
+                del place[path.pop()]
+                continue
+            vertex = ways.pop()
+            if not ways:
+                del following[path[-1]]
+            if vertex in place:
+                loop = path[place[vertex] :]
+                yield np.array(loop)
+                for passed in loop[1:]:
+                    del place[passed]
+                del path[place[vertex] + 1 :]
+            else:
+                place[vertex] = len(path)
+                path.append(vertex)
 
 
 def _caps(surface: Surface, rims: list[np.ndarray]) -> _Caps:
@@ -130,6 +144,15 @@ def _faired(vertices_mm: np.ndarray, triangles: np.ndarray, first: int) -> np.nd
     free = laplacian[:, first:]
     right = -free.T @ (laplacian[:, :first] @ vertices_mm[:first].astype(np.float64))
     return spsolve((free.T @ free).tocsc(), right).reshape(-1, 3)
+
+
+def _upright(surface: Surface, rims: list[np.ndarray], vertices_mm: np.ndarray, caps: _Caps) -> np.ndarray:
+    """Bool [holes]: caps no triangle of which faces away from where the surface around it does."""
+    facing = np.stack([surface.normals[rim].sum(axis=0) for rim in rims])
+    corners = vertices_mm[caps.triangles]
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    turned = np.einsum("ta,ta->t", normal, facing[caps.triangle_hole]) <= 0
+    return np.bincount(caps.triangle_hole, turned, len(rims)) == 0
 
 
 def _unpierced(

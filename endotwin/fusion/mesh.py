@@ -75,6 +75,16 @@ def proper(triangles: np.ndarray) -> np.ndarray:
     return (a != b) & (b != c) & (c != a)
 
 
+def single(triangles: np.ndarray) -> np.ndarray:
+    """``triangles`` [F, 3] without those that lie on the same side of an edge as an earlier one."""
+    start, end = triangles.astype(np.int64), np.roll(triangles, -1, axis=1)
+    edge = (start * (int(triangles.max(initial=0)) + 1) + end).ravel()
+    order = np.argsort(edge, kind="stable")
+    again = np.zeros(len(edge), bool)
+    again[order[1:]] = edge[order[1:]] == edge[order[:-1]]
+    return triangles[~again.reshape(-1, 3).any(axis=1)]
+
+
 def boundary_edges(triangles: np.ndarray) -> np.ndarray:
     """Directed edges [B, 2] of triangles [F, 3] that no neighbour has the other way round."""
     edges = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]]).astype(

@@ -1,37 +1,58 @@
 """Rays decide what is missing: where a measured pixel misses the surface, that view's own depth is
-triangulated."""
+triangulated, and sewn to the rims of what is there."""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
+from scipy.spatial import Delaunay
 
 from endotwin.cameras import Camera
 from endotwin.casting import Caster
 from endotwin.fusion.agreement import Comparison
-from endotwin.fusion.mesh import proper
-from endotwin.surface import Surface
-
-WELD_VOXELS = 1.0
-"""A patch takes over a vertex of the surface that is this near instead of making its own."""
+from endotwin.fusion.mesh import boundary_edges, proper
+from endotwin.fusion.refine import LEAST_COSINE
 
 LEAST_CROWD = 3
 """A pixel that sees through is patched when this many of the nine there lack a surface; fewer is noise."""
 
+REACH_PX = 2.0
+"""A patch joins its pixels to what is there over at most so many pixels."""
 
-class Patches:
-    """Patches of a surface, made view by view, each only where no earlier one explains the pixel.
 
-    Vertex numbers continue those of the surface, whose vertices the patches share along their rims.
+@dataclass(frozen=True)
+class _Points:
+    """Vertices as one view sees them, N of them.
+
+    Attributes:
+        vertex: int [N], numbers. uv: float64 [N, 2], pixel coordinates. distance_mm: float32 [N], from the
+            lens. allowed_mm: float32 [N], tolerance of the distance.
     """
 
-    def __init__(self, camera: Camera, surface: Surface, voxel_mm: float):
+    vertex: np.ndarray
+    uv: np.ndarray
+    distance_mm: np.ndarray
+    allowed_mm: np.ndarray
+
+    def __add__(self, other: _Points) -> _Points:
+        pairs = zip(vars(self).values(), vars(other).values(), strict=True)
+        return _Points(*(np.concatenate(pair) for pair in pairs))
+
+
+class Patches:
+    """Patches of a caster's surface, made view by view, each only where no earlier one explains the pixel.
+
+    Vertex numbers continue those of the surface, whose rims the patches share.
+    """
+
+    def __init__(self, camera: Camera, caster: Caster):
         self._camera = camera
-        self._surface = surface
-        self._weld_mm = WELD_VOXELS * voxel_mm
-        self.vertices_mm = surface.vertices_mm
+        self._base = caster
+        self._surface = caster.surface
+        self.vertices_mm = self._surface.vertices_mm
+        self._rim = np.unique(boundary_edges(self._surface.triangles))
         self._scenes: list[Caster] = []
 
     @property
@@ -41,19 +62,20 @@ class Patches:
         return np.concatenate([none, *(scene.surface.triangles for scene in self._scenes)])
 
     def add(self, seen: Comparison) -> None:
-        """Triangulate 2×2 neighbours of which at least one lacks a surface and whose distances do not
-        jump."""
-        lacking = self._unexplained(seen)
+        """Triangulate, in the image, the pixels that lack a surface and what is there beside them, where
+        distances do not jump; but nothing that would lie on what is there."""
+        lacking, triangle = self._unexplained(seen)
         if not lacking.any():
             return
-        quads = _smooth_quads(seen.view.distance_mm, lacking, seen.allowed_mm)
-        if len(quads) == 0:
-            return
-        pixel, corner = np.unique(quads, return_inverse=True)
-        number = self._welded(self._points(seen, pixel), np.where(seen.at, seen.triangle, -1)[pixel])
-        quads = number[corner.reshape(-1, 4)]
-        triangles = np.concatenate([quads[:, [0, 2, 1]], quads[:, [1, 2, 3]]])
-        self._remember(triangles[proper(triangles)])
+        there = self._pixels_beside(seen, lacking, triangle) + self._rims_beside(seen, lacking)
+        points = self._added(seen, np.flatnonzero(lacking)) + there
+        new = np.arange(len(points.uv)) < lacking.sum()
+        corners = _triangulated(points, new)
+        covered = ~new[corners].all(axis=1)
+        covered[covered] = self._explained(seen, points, corners[covered])
+        triangles = points.vertex[corners[~covered]].astype(np.int32)
+        self._rim = np.r_[self._rim, np.unique(boundary_edges(triangles))]
+        self._remember(triangles)
 
     def _remember(self, triangles: np.ndarray) -> None:
         """Add triangles [N, 3] to the scenes.
@@ -66,47 +88,108 @@ class Patches:
             patches = replace(self._surface, vertices_mm=self.vertices_mm, triangles=triangles)
             self._scenes.append(Caster(patches))
 
-    def _unexplained(self, seen: Comparison) -> np.ndarray:
-        """Bool [H·W]: pixels that lack a surface and that no patch lies at or in front of."""
+    def _unexplained(self, seen: Comparison) -> tuple[np.ndarray, np.ndarray]:
+        """Bool [H·W]: pixels that lack a surface and that no patch lies at or in front of; and int32 [H·W],
+        the triangle that each of the others lies on (those of patches counted on from the surface's), or
+        -1."""
         shape = seen.view.distance_mm.shape
         crowd = cv2.boxFilter(seen.lacking.reshape(shape).astype(np.float32), -1, (3, 3), normalize=False)
         lacking = seen.lacking & ((seen.triangle < 0) | (crowd.reshape(-1) >= LEAST_CROWD))
-        reach_mm = seen.view.distance_mm.reshape(-1) + seen.allowed_mm
+        triangle = np.where(seen.at, seen.triangle, -1)
+        first = len(self._surface.triangles)
         for scene in self._scenes:
             hits = scene.cast(self._camera, seen.view.T_world_camera, lacking.reshape(shape))
-            lacking[hits.pixel[hits.distance_mm <= reach_mm[hits.pixel]]] = False
-        return lacking
+            behind_mm = hits.distance_mm - seen.view.distance_mm.reshape(-1)[hits.pixel]
+            allowed_mm = seen.allowed_mm[hits.pixel]
+            lacking[hits.pixel[behind_mm <= allowed_mm]] = False
+            at = np.abs(behind_mm) <= allowed_mm
+            triangle[hits.pixel[at]] = first + hits.triangle[at]
+            first += len(scene.surface.triangles)
+        return lacking, triangle
 
-    def _points(self, seen: Comparison, pixel: np.ndarray) -> np.ndarray:
+    def _explained(self, seen: Comparison, points: _Points, corners: np.ndarray) -> np.ndarray:
+        """Bool [T]: triangles with ``corners`` [T, 3] at or behind whose middle there is surface or patch."""
+        lens_mm = self._surface.to_local(seen.view.T_world_camera)[:3, 3].astype(np.float32)
+        ray_mm = self.vertices_mm[points.vertex[corners]].mean(axis=1) - lens_mm
+        distance_mm = np.linalg.norm(ray_mm, axis=1)
+        origins, directions = np.broadcast_to(lens_mm, ray_mm.shape), ray_mm / distance_mm[:, None]
+        length_mm = distance_mm + points.allowed_mm[corners[:, 0]]
+        clear = [scene.unobstructed(origins, directions, length_mm) for scene in (self._base, *self._scenes)]
+        return ~np.all(clear, axis=0)
+
+    def _added(self, seen: Comparison, pixel: np.ndarray) -> _Points:
+        """New vertices where pixels [N] measured."""
+        first = len(self.vertices_mm)
+        self.vertices_mm = np.concatenate([self.vertices_mm, self._measured_mm(seen, pixel)])
+        return self._at_pixels(seen, pixel, np.arange(first, len(self.vertices_mm)))
+
+    def _pixels_beside(self, seen: Comparison, lacking: np.ndarray, triangle: np.ndarray) -> _Points:
+        """For pixels beside ``lacking`` ones, the nearest vertex of the ``triangle`` that they lie on."""
+        beside = cv2.dilate(lacking.reshape(seen.view.distance_mm.shape).view(np.uint8), np.ones((3, 3)))
+        pixel = np.flatnonzero((beside.reshape(-1) > 0) & ~lacking & (triangle >= 0))
+        number, count = triangle[pixel], len(self._surface.triangles)
+        on = self._surface.triangles[np.minimum(number, count - 1)]
+        on[number >= count] = self.triangles[number[number >= count] - count]
+        apart_mm = self.vertices_mm[on] - self._measured_mm(seen, pixel)[:, None]
+        nearest = (apart_mm**2).sum(axis=2).argmin(axis=1)
+        return self._at_pixels(seen, pixel, on[np.arange(len(on)), nearest])
+
+    def _at_pixels(self, seen: Comparison, pixel: np.ndarray, vertex: np.ndarray) -> _Points:
+        v, u = np.divmod(pixel, self._camera.width)
+        distance_mm = seen.view.distance_mm.reshape(-1)[pixel]
+        return _Points(
+            vertex, np.stack([u, v], axis=1).astype(np.float64), distance_mm, seen.allowed_mm[pixel]
+        )
+
+    def _measured_mm(self, seen: Comparison, pixel: np.ndarray) -> np.ndarray:
         """What pixels [N] measured, in the local frame, float32 [N, 3]."""
         T_local_camera = self._surface.to_local(seen.view.T_world_camera)
         directions = self._camera.pixel_directions.reshape(-1, 3)[pixel].astype(np.float64)
         points = (directions * seen.view.distance_mm.reshape(-1)[pixel, None]) @ T_local_camera[:3, :3].T
         return (points + T_local_camera[:3, 3]).astype(np.float32)
 
-    def _welded(self, points: np.ndarray, triangle: np.ndarray) -> np.ndarray:
-        """Vertex numbers of ``points`` [N, 3]: the nearest vertex of the triangle [N] they lie on (-1:
-        none), or a new one."""
-        corners = self._surface.triangles[triangle]
-        gap_mm = np.linalg.norm(self._surface.vertices_mm[corners] - points[:, None], axis=2)
-        nearest = gap_mm.argmin(axis=1)[:, None]
-        weld = (triangle >= 0) & (np.take_along_axis(gap_mm, nearest, axis=1)[:, 0] <= self._weld_mm)
-        number = np.take_along_axis(corners, nearest, axis=1)[:, 0].astype(np.int32)
-        number[~weld] = len(self.vertices_mm) + np.arange((~weld).sum())
-        self.vertices_mm = np.concatenate([self.vertices_mm, points[~weld]])
-        return number
+    def _rims_beside(self, seen: Comparison, lacking: np.ndarray) -> _Points:
+        """Vertices on rims near ``lacking`` pixels that lie where one of the four pixels about them
+        measured."""
+        height, width = seen.view.distance_mm.shape
+        T_local_camera = self._surface.to_local(seen.view.T_world_camera).astype(np.float32)
+        ray_mm = self.vertices_mm[self._rim] - T_local_camera[:3, 3]
+        uv = self._camera.project(np.einsum("va,ab->vb", ray_mm, T_local_camera[:3, :3]))
+        with np.errstate(invalid="ignore"):
+            inside = np.flatnonzero(((uv >= 0) & (uv < (width - 1, height - 1))).all(axis=1))
+        near = cv2.dilate(lacking.reshape(height, width).view(np.uint8), np.ones((5, 5)))
+        u, v = np.rint(uv[inside]).astype(np.int32).T
+        inside = inside[near[v, u] > 0]
+        inside = inside[self._faces(self._rim[inside], ray_mm[inside])]
+        distance_mm = np.linalg.norm(ray_mm[inside], axis=1)
+        u, v = uv[inside].astype(np.int32).T
+        about = (v * width + u)[:, None] + np.array([0, 1, width, width + 1])
+        gap_mm = np.abs(seen.view.distance_mm.reshape(-1)[about] - distance_mm[:, None])
+        best = np.nan_to_num(gap_mm, nan=np.inf).argmin(axis=1)
+        rows = np.arange(len(best))
+        allowed_mm = seen.allowed_mm[about[rows, best]]
+        at = np.flatnonzero(gap_mm[rows, best] <= allowed_mm)
+        return _Points(self._rim[inside[at]], uv[inside[at]], distance_mm[at], allowed_mm[at])
+
+    def _faces(self, vertex: np.ndarray, ray_mm: np.ndarray) -> np.ndarray:
+        """Bool [N]: vertices [N] that a ray [N, 3] to each meets from the front; those of patches always."""
+        faces = np.ones(len(vertex), bool)
+        own = np.flatnonzero(vertex < len(self._surface.normals))
+        along_mm = np.einsum("va,va->v", ray_mm[own], self._surface.normals[vertex[own]])
+        faces[own] = -along_mm > LEAST_COSINE * np.linalg.norm(ray_mm[own], axis=1)
+        return faces
 
 
-def _smooth_quads(distance_mm: np.ndarray, wanted: np.ndarray, allowed_mm: np.ndarray) -> np.ndarray:
-    """Row-major pixels [Q, 4] (a b / c d) of 2×2 neighbours with any in ``wanted`` and no step beyond the
-    tolerances."""
-
-    height, width = distance_mm.shape
-    square = np.ones((2, 2), np.uint8)
-    any_wanted = cv2.dilate(wanted.reshape(height, width).view(np.uint8), square, anchor=(0, 0))
-    row, column = np.nonzero(any_wanted[:-1, :-1])
-    pixel = (row * width + column)[:, None] + np.array([0, 1, width, width + 1])
-    near = distance_mm.reshape(-1)[pixel]
-    with np.errstate(invalid="ignore"):
-        smooth = np.ptp(near, axis=1) <= 2 * allowed_mm[pixel[:, 0]]
-    return pixel[smooth]
+def _triangulated(points: _Points, new: np.ndarray) -> np.ndarray:
+    """Delaunay triangles [T, 3] of the points in the image, facing the lens, without jumps of distance and
+    without edges longer than REACH_PX (twice that where neither end is ``new`` [N])."""
+    far = np.abs(points.uv).max() + 10
+    frame = np.array([(-far, -far), (2 * far, -far), (2 * far, 2 * far), (-far, 2 * far)])
+    corners = Delaunay(np.concatenate([points.uv, frame])).simplices[:, ::-1]
+    corners = corners[(corners < len(points.uv)).all(axis=1)]
+    following = np.roll(corners, -1, axis=1)
+    length_px = np.hypot(*(points.uv[corners] - points.uv[following]).transpose(2, 0, 1))
+    short = length_px <= REACH_PX * np.where(new[corners] | new[following], 1, 2)
+    jump_mm = np.ptp(points.distance_mm[corners], axis=1)
+    smooth = jump_mm <= 2 * points.allowed_mm[corners].min(axis=1)
+    return corners[short.all(axis=1) & smooth & proper(points.vertex[corners])]

@@ -7,9 +7,10 @@ from collections.abc import Iterable
 import numpy as np
 
 from endotwin.cameras import Camera
+from endotwin.casting import Caster
 from endotwin.fusion.agreement import Tolerance, compare
 from endotwin.fusion.carve import Votes
-from endotwin.fusion.mesh import surface_of
+from endotwin.fusion.mesh import single, surface_of
 from endotwin.fusion.patch import Patches
 from endotwin.fusion.views import View
 from endotwin.surface import Surface
@@ -26,11 +27,12 @@ def reconciled(
     Returns:
         the surface, and by frame the share of its measured pixels that agreed with the one before.
     """
-    votes, patches = Votes(surface), Patches(camera, surface, voxel_mm)
+    caster = Caster(surface)
+    votes, patches = Votes(surface), Patches(camera, caster)
     agreeing = {}
-    for seen in compare(camera, surface, views, tolerance):
+    for seen in compare(camera, caster, views, tolerance):
         votes.add(seen)
         patches.add(seen)
         agreeing[seen.view.index] = float(seen.at.sum() / np.isfinite(seen.view.distance_mm).sum())
-    triangles = np.concatenate([surface.triangles[votes.kept()], patches.triangles])
+    triangles = single(np.concatenate([surface.triangles[votes.kept()], patches.triangles]))
     return surface_of(surface.origin_mm, patches.vertices_mm, triangles), agreeing
