@@ -54,6 +54,9 @@ GLOBAL_SPREAD = (5.0, 0.5, 0.25, 0.1, 0.5, 0.5)
 GLOBAL_RANGE = ((-20.0, 20.0), (0.0, 10.0), (0.0, 4.0), (0.15, 1.5), (-6.0, -0.7), (-1.5, 1.5))
 """Prior and bounds of the shared parameters, in the order of BOUNCE_GLOBALS."""
 
+DARKEST_LOG_SCALE = -1.2
+"""With albedos scaled by less than e to this the brightest tissue would reflect a quarter of the light."""
+
 COLOR_RANGE = (1e-3, 2.0)
 
 CG_TOLERANCE = 1e-3
@@ -325,7 +328,7 @@ def at_bounds(shared: Globals) -> list[str]:
 
 def darkest(shared: Globals) -> bool:
     """Whether light between tissue asks for darker tissue than there is."""
-    return shared.log_scale <= GLOBAL_RANGE[-1][0]
+    return shared.log_scale <= DARKEST_LOG_SCALE
 
 
 def bounded(shared: Globals, vector: Tensor) -> Globals:

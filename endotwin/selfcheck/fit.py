@@ -104,7 +104,7 @@ def seeds() -> Iterator[Finding]:
     with tempfile.TemporaryDirectory() as folder:
         fused = fuse_twin(SCENE.write(Path(folder) / "tube", flight(12)))
         twins = [fit_twin(fused, seed=seed, config=FEW_PIXELS) for seed in (*range(SEEDS), 0)]
-        yield from spread(twins[:-1], 0.5, 2)
+        yield from spread(twins[:-1], 1.0, 2)
     one, again = twins[0], twins[-1]
     maps, others = one.materials.per_vertex, again.materials.per_vertex
     differ = sum(int((maps[name] != others[name]).sum()) for name in maps)
