@@ -63,15 +63,20 @@ def _rims(surface: Surface, longest_mm: float) -> list[np.ndarray]:
 
     The outline of a loose piece is left out: closed, it would be a bubble.
     """
-    rims = []
-    for rim in _loops(boundary_edges(surface.triangles)):
-        points = surface.vertices_mm[rim]
-        step_mm = np.roll(points, -1, axis=0) - points
-        spanned = np.cross(np.roll(points, -1, axis=0) - points[0], points - points[0]).sum(axis=0)
-        short = np.sqrt((step_mm**2).sum(axis=1)).sum() <= longest_mm
-        if len(rim) > 2 and short and spanned @ surface.normals[rim].sum(axis=0) > 0:
-            rims.append(rim)
-    return rims
+    loops = [loop for loop in _loops(boundary_edges(surface.triangles)) if len(loop) > 2]
+    if not loops:
+        return []
+    size = np.array([len(loop) for loop in loops])
+    first = np.cumsum(size) - size
+    points_mm = surface.vertices_mm[np.concatenate(loops)]
+    following = np.arange(1, len(points_mm) + 1)
+    following[first + size - 1] = first
+    next_mm, start_mm = points_mm[following], np.repeat(points_mm[first], size, axis=0)
+    length_mm = np.add.reduceat(np.linalg.norm(next_mm - points_mm, axis=1), first)
+    spanned = np.add.reduceat(np.cross(next_mm - start_mm, points_mm - start_mm), first)
+    facing = np.add.reduceat(surface.normals[np.concatenate(loops)], first)
+    holes = (length_mm <= longest_mm) & (np.einsum("la,la->l", spanned, facing) > 0)
+    return [loops[index] for index in np.flatnonzero(holes)]
 
 
 def _loops(edges: np.ndarray) -> Iterator[np.ndarray]:
