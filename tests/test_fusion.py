@@ -7,6 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import scenes
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial import Delaunay
 
 from endotwin.cameras import CALIBRATIONS
 from endotwin.casting import Caster
@@ -16,6 +19,7 @@ from endotwin.fusion._open3d import o3c, o3d
 from endotwin.fusion.agreement import Tolerance, agreement
 from endotwin.fusion.faces import distance_mm, split
 from endotwin.fusion.mesh import boundary_edges, surface_of
+from endotwin.fusion.patch import _delaunay
 from endotwin.fusion.reconcile import reconciled
 from endotwin.fusion.views import read_views
 from endotwin.readers import open_sequence
@@ -322,3 +326,16 @@ def test_colon_direct_disagrees_with_few_pixels(data_root):
     seen = read_views(sequence, range(0, 64, 8))
     assert agreement(sequence.camera, surface, seen, TOLERANCE).agrees > 0.9985
     assert mean_distance_mm(surface, data_root / "colon_direct" / "truth" / "colon.ply") < 0.01
+
+
+@given(seed=st.integers(0, 2**32 - 1), pixels=st.integers(1, 300), others=st.integers(0, 100))
+def test_points_in_the_image_are_triangulated_as_qhull_does(seed, pixels, others):
+    generator = np.random.default_rng(seed)
+    grid = np.stack(np.meshgrid(np.arange(32.0), np.arange(32.0)), axis=-1).reshape(-1, 2)
+    rim = grid[(grid % 31 == 0).any(axis=1)]
+    uv = np.concatenate([rim, generator.permutation(grid)[:pixels], generator.uniform(0, 31, (others, 2))])
+    a, b, c = uv[_delaunay(uv)].transpose(1, 0, 2)
+    twice_area = (b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0]
+    assert (twice_area < 0).all()
+    assert twice_area.sum() == pytest.approx(-2 * 31**2, rel=1e-6)
+    assert len(twice_area) == len(Delaunay(np.unique(uv.astype(np.float32), axis=0)).simplices)
