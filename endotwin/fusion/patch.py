@@ -20,6 +20,9 @@ LEAST_CROWD = 3
 REACH_PX = 2.0
 """A patch joins its pixels to what is there over at most so many pixels."""
 
+SUBDIVISIONS = 64
+"""Of a pixel, at which points are triangulated: OpenCV's tests are exact there."""
+
 
 @dataclass(frozen=True)
 class _Points:
@@ -194,10 +197,11 @@ def _triangulated(points: _Points, new: np.ndarray) -> np.ndarray:
 def _delaunay(uv: np.ndarray) -> np.ndarray:
     """Delaunay triangles [T, 3] of pixel coordinates [N, 2] >= 0, seen clockwise with y up.
 
-    On grids OpenCV takes a sixth of Qhull's time. It names corners by their coordinates, which are found
-    again by their bits. Slivers along the convex hull may be missing.
+    On grids OpenCV takes a sixth of Qhull's time. It needs coordinates that are not almost the same, and
+    names corners by them, so that they are found again by their bits. Slivers along the convex hull may be
+    missing.
     """
-    uv = uv.astype(np.float32) + np.float32(0)  # no -0, whose bits are not 0's
+    uv = (np.rint(uv * SUBDIVISIONS) / SUBDIVISIONS).astype(np.float32) + np.float32(0)  # no -0
     width, height = np.ceil(uv.max(axis=0)).astype(int) + 2
     plane = cv2.Subdiv2D((-1, -1, int(width) + 1, int(height) + 1))
     plane.insert(uv.tolist())
