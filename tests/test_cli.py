@@ -107,7 +107,7 @@ def test_a_sequence_becomes_a_twin_scores_a_dataset_and_a_picture(endotwin, made
 def test_eval_keeps_the_scores_in_the_twin_and_says_that_lpips_is_missing(
     endotwin, made, tmp_path, monkeypatch
 ):
-    from endotwin import metrics
+    from endotwin.evaluation import metrics
     from endotwin.twin import Twin
 
     monkeypatch.setattr(metrics, "_lpips_network", lambda: None)

@@ -11,13 +11,13 @@ import torch
 import tube_sequence
 
 import endotwin
-from endotwin.casting import Caster
 from endotwin.config import FitConfig
-from endotwin.evaluation import covered_pixels
+from endotwin.evaluation.evaluation import covered_pixels
 from endotwin.fit import fit
-from endotwin.fit.pace import Pace
-from endotwin.fit.samples import gather
 from endotwin.fit.solve import median_edge_mm, proxies
+from endotwin.pixels.pace import Pace
+from endotwin.pixels.samples import gather
+from endotwin.surface.casting import Caster
 
 
 @pytest.fixture(scope="module", autouse=True)

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from endotwin.errors import OutputError
-from endotwin.output import check_apart, check_free, check_picture, whole_file, whole_folder
+from endotwin.run.output import check_apart, check_free, check_picture, whole_file, whole_folder
 
 FILES = ("mark", "a", "old")
 

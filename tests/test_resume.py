@@ -13,8 +13,9 @@ import pytest
 import tube_twin
 
 from endotwin.errors import OptionError, OutputError
-from endotwin.synth import Trajectory, crew, synthesize
-from endotwin.synth.partial import Partial, partial_path
+from endotwin.synth import Trajectory, synthesize
+from endotwin.synth.run import crew
+from endotwin.synth.run.partial import Partial, partial_path
 from endotwin.twin import Twin
 
 FRAMES = 56

@@ -13,8 +13,8 @@ from endotwin.cli import console
 from endotwin.cli import synth as command
 from endotwin.cli.main import main
 
-from endotwin.poses import write_c3vd_poses
-from endotwin.readers import open_sequence
+from endotwin.sequence.poses import write_c3vd_poses
+from endotwin.sequence.readers import open_sequence
 from endotwin.synth import DEFAULT_LABELS, LABELS, LAYOUTS
 
 FRAMES = 40

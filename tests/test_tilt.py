@@ -10,17 +10,18 @@ import tube_twin
 
 import endotwin
 from endotwin.cameras import Pinhole
-from endotwin.casting import Caster
 from endotwin.config import FitConfig
 from endotwin.effects import Effects
 from endotwin.fit import fit
 from endotwin.fit.gauss_newton import GaussNewton, State, roughness_to_raw
+from endotwin.fit.hashgrid import HashOperator
 from endotwin.fit.model import Globals
-from endotwin.fit.samples import Samples
 from endotwin.fit.tilt import tilted
-from endotwin.hashgrid import HashOperator
-from endotwin.incidence import incidence, unit
+from endotwin.light.incidence import incidence
+from endotwin.pixels.samples import Samples
 from endotwin.render import Renderer
+from endotwin.surface.casting import Caster
+from endotwin.surface.vectors import unit
 
 DISTURBED_DEG = 1.0
 

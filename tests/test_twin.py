@@ -9,7 +9,8 @@ import tube_twin
 from scenes import omni
 
 from endotwin.errors import OutputError, TwinError
-from endotwin.twin import VERSION, Source, Twin
+from endotwin.twin import Source, Twin
+from endotwin.twin.twin import VERSION
 
 
 @pytest.fixture(scope="module")

@@ -12,7 +12,7 @@ import tube_twin
 from endotwin import pipeline
 from endotwin.effects.offset import Offset
 from endotwin.errors import OptionError
-from endotwin.poses import write_c3vd_poses
+from endotwin.sequence.poses import write_c3vd_poses
 from endotwin.synth import Trajectory, fixed, parse_light_edit, parse_material_edit, synthesize
 from endotwin.synth.variation import Variation, read_variation
 

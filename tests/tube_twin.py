@@ -71,9 +71,7 @@ def seen(unseen: Surface, towards: float = 1.0) -> Surface:
     s, _ = to_axis(unseen.vertices_mm + unseen.origin_mm)
     nearest_mm = 15 + BEND_MM * (s if towards > 0 else SWEEP - s)
     count = len(s)
-    return unseen.with_coverage(
-        np.full(count, 5, np.int32), np.full(count, 0.7, np.float32), nearest_mm.astype(np.float32)
-    )
+    return unseen.with_coverage(np.full(count, 5, np.int32), nearest_mm.astype(np.float32))
 
 
 def fitted(mesh: Surface, source: Path | str = "nowhere") -> Twin:

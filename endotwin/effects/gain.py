@@ -19,7 +19,6 @@ class Gain(Effect):
     """
 
     name: ClassVar[str] = "gain"
-    kind: ClassVar[str] = "sensor"
     frames: tuple[int, ...] = ()
     log_gain: tuple[float, ...] = ()
 

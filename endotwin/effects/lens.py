@@ -33,8 +33,7 @@ class Lens(Effect):
     """
 
     name: ClassVar[str] = "lens"
-    kind: ClassVar[str] = "optics"
-    half_angle_deg: float = parameter(WHOLE_FIELD_DEG, 1.0, WHOLE_FIELD_DEG, "degree")
+    half_angle_deg: float = parameter(WHOLE_FIELD_DEG, 1.0, WHOLE_FIELD_DEG)
 
     def mask(self, camera: Camera) -> np.ndarray:
         """Bool [H, W]: pixels whose ray passes the stop."""

@@ -7,7 +7,8 @@ from pathlib import Path
 
 from endotwin.config import METHODS, STANDARD, FitConfig
 from endotwin.errors import OptionError
-from endotwin.fit.pace import Pace
+from endotwin.pixels.pace import Pace
+from endotwin.surface.casting import Caster
 from endotwin.twin import Twin
 
 
@@ -19,6 +20,7 @@ def fit(
     progress: Callable[[str, int, int], None] | None = None,
     checkpoint: Path | None = None,
     effects: Mapping[str, str] | None = None,
+    price: Callable[[Twin, Caster], Twin] = lambda twin, caster: twin,
 ) -> Twin:
     """The twin with materials, light and response fitted to its training photos.
 
@@ -29,6 +31,7 @@ def fit(
         progress: called with (label, done, total).
         checkpoint: where ``endopbr`` keeps what it has learned so far, to go on from there if it is stopped.
         effects: auto, on or off by name of the effect, ``twin`` only; auto unless named.
+        price: gives the fitted twin's decisions what each effect costs a rendering, ``twin`` only.
 
     Raises:
         OptionError: an unknown method, or an option that the method does not have.
@@ -43,7 +46,7 @@ def fit(
             )
         from endotwin.fit.solve import fit_twin
 
-        return fit_twin(twin, Pace(config, progress), seed, effects or {})
+        return fit_twin(twin, Pace(config, progress), seed, effects or {}, price)
     from endotwin.fit.endopbr import fit_endopbr
 
     return fit_endopbr(twin, config.budget, epochs, seed, progress, checkpoint)

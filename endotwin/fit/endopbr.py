@@ -18,14 +18,15 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from endotwin import shading
 from endotwin.errors import SequenceError
 from endotwin.fit.checkpoint import Checkpoint, identity
-from endotwin.fit.start import ALBEDO_TOP
-from endotwin.hashgrid import corner_slots
-from endotwin.incidence import COS_MIN, unit
+from endotwin.fit.hashgrid import corner_slots
+from endotwin.light import shading
+from endotwin.light.incidence import COS_MIN
+from endotwin.pixels.start import ALBEDO_TOP
+from endotwin.run.stopwatch import Stopwatch
 from endotwin.sequence import Frame
-from endotwin.stopwatch import Stopwatch
+from endotwin.surface.vectors import unit
 from endotwin.twin import Light, Materials, Response, Twin
 
 LEVELS, FEATURES, LOG2_SLOTS = 16, 2, 19

@@ -18,12 +18,12 @@ import scipy.linalg
 import torch
 from torch import Tensor
 
+from endotwin.fit.hashgrid import HashOperator
 from endotwin.fit.model import Globals, at_pixels, predict
-from endotwin.fit.normal import CHANNELS, MeshPattern, NormalEquations, assemble, robust_cost
-from endotwin.fit.samples import Samples, drawn
-from endotwin.fit.start import PRIOR
-from endotwin.hashgrid import HashOperator
-from endotwin.shading import F0_DIELECTRIC
+from endotwin.fit.normal_equations import CHANNELS, MeshPattern, NormalEquations, assemble, robust_cost
+from endotwin.light.shading import F0_DIELECTRIC
+from endotwin.pixels.samples import Samples, drawn
+from endotwin.pixels.start import PRIOR
 
 NOISE_MIN = 1 / 255
 """Least noise assumed, in display values: 8-bit rounding and a step of sensor noise."""

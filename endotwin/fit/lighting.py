@@ -9,19 +9,19 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from endotwin import shading
-from endotwin.casting import Caster
 from endotwin.effects import Effects
 from endotwin.fit.gauss_newton import HUBER, GaussNewton, State
 from endotwin.fit.model import Globals, at_pixels, slope_by_log_exposure
-from endotwin.fit.normal import Residual
-from endotwin.fit.samples import Bounce, Samples
-from endotwin.guides import AT_LENS, COSINE, Guided, guided, log_axis, visible_from
-from endotwin.incidence import unit
-from endotwin.radiosity import Radiosity
+from endotwin.fit.normal_equations import Residual
+from endotwin.light import shading
+from endotwin.light.guides import AT_LENS, COSINE, Guided, guided, log_axis, visible_from
+from endotwin.light.radiosity import Radiosity
+from endotwin.pixels.samples import Bounce, Samples
+from endotwin.surface.casting import Caster
+from endotwin.surface.vectors import unit
 from endotwin.twin import Twin
 
-STEP = 0.05
+LIGHT_STEP = 0.05
 """Step of the finite differences of the bounced light, in n, q and the logarithm of all albedo."""
 
 
@@ -159,8 +159,8 @@ class Bouncer:
             return np.log(np.maximum(at_pixels, 1e-30))
 
         here = log_irradiance(n, q, scale)
-        moved = ((n + STEP, q, scale), (n, q + STEP, scale), (n, q, scale + STEP))
-        slopes = [(log_irradiance(*at) - here).mean(axis=1) / STEP for at in moved]
+        moved = ((n + LIGHT_STEP, q, scale), (n, q + LIGHT_STEP, scale), (n, q, scale + LIGHT_STEP))
+        slopes = [(log_irradiance(*at) - here).mean(axis=1) / LIGHT_STEP for at in moved]
         level = here - (n * slopes[0] + q * slopes[1] + scale * slopes[2])[:, None]
         columns = [torch.from_numpy(np.ascontiguousarray(x, np.float32)) for x in (level, *slopes)]
         gloss = shading.specular_of_even_light(samples.cos, roughness, f0) * math.exp(-scale)

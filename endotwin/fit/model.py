@@ -15,9 +15,9 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from endotwin import shading
 from endotwin.effects.coat import F0_WATER, Coat
-from endotwin.fit.samples import Samples
+from endotwin.light import shading
+from endotwin.pixels.samples import Samples
 from endotwin.twin import Light, Response
 
 GLOBALS = ("gamma·ln L0", "gamma·n", "gamma·q", "gamma", "ln f0")
@@ -83,12 +83,12 @@ def at_pixels(samples: Samples, triangles: Tensor, per_vertex: Tensor) -> Tensor
 
 @dataclass(frozen=True)
 class _Lit:
-    """What one guide does at N pixels: x = per_color·b + shine + weight·film; each [N], like its ln of cone
+    """What one guide does at N pixels: x = per_color·b + shine + weight·coat; each [N], like its ln of cone
     and distance."""
 
     per_color: Tensor
     shine: Tensor | None
-    film: Tensor | None
+    coat: Tensor | None
     log_axis: Tensor
     log_distance: Tensor
 
@@ -105,8 +105,8 @@ def _guides(samples: Samples, roughness: Tensor, shared: Globals) -> list[_Lit]:
         def lobe(roughness: Tensor) -> Tensor:
             return strength * shading.specular_colocated(samples.cos, samples.sin2, roughness)
 
-        shine, film = _lobes(lobe, roughness, shared)
-        return [_Lit(per_color, shine, film, samples.log_cos_axis, samples.log_distance)]
+        shine, coat = _lobes(lobe, roughness, shared)
+        return [_Lit(per_color, shine, coat, samples.log_cos_axis, samples.log_distance)]
     guides, found = samples.guides, []
     count = guides.cos_i.shape[1]
     for k in range(count):
@@ -120,8 +120,8 @@ def _guides(samples: Samples, roughness: Tensor, shared: Globals) -> list[_Lit]:
         def lobe(roughness: Tensor, k=k, cos_i=cos_i, strength=strength) -> Tensor:
             return strength * shading.specular_lobe(cos_i, samples.cos, guides.sin2_m[:, k], roughness)
 
-        shine, film = _lobes(lobe, roughness, shared)
-        found.append(_Lit(per_color, shine, film, log_axis, log_distance))
+        shine, coat = _lobes(lobe, roughness, shared)
+        found.append(_Lit(per_color, shine, coat, log_axis, log_distance))
     return found
 
 
@@ -151,7 +151,7 @@ def radiance(samples: Samples, material: Tensor, shared: Globals) -> Tensor:
     if shared.specular:
         x = x + sum(guide.shine for guide in lit)[:, None]
     if shared.coat is not None:
-        x = x + shared.coat.weight * sum(guide.film for guide in lit)[:, None]
+        x = x + shared.coat.weight * sum(guide.coat for guide in lit)[:, None]
     if samples.bounce is None:
         return x
     return x + _bounced(samples, shared) * (material[:, :3] + samples.bounce.gloss[:, None])
@@ -202,9 +202,9 @@ def linearise(samples: Samples, material: Tensor, shared: Globals) -> Linearised
             shine_slope = torch.autograd.grad(shine.sum(), roughness)[0]
     base_color, per_color, shine = material[:, :3].detach(), per_color.detach()[:, None], shine.detach()
     x = per_color * base_color + shine[:, None]
-    film = None if shared.coat is None else sum(guide.film for guide in lit).detach()[:, None]
-    if film is not None:
-        x = x + shared.coat.weight * film
+    coat = None if shared.coat is None else sum(guide.coat for guide in lit).detach()[:, None]
+    if coat is not None:
+        x = x + shared.coat.weight * coat
     axis, distance = _moments(lit, base_color, shared)
     if samples.bounce is not None:
         bounced = _bounced(samples, shared)
@@ -230,7 +230,7 @@ def linearise(samples: Samples, material: Tensor, shared: Globals) -> Linearised
         by_color=by_color,
         by_roughness=slope * (color_slope[:, None] * base_color + shine_slope[:, None]),
         by_globals=torch.stack(by_globals, dim=-1),
-        by_coat=None if film is None else slope * film,
+        by_coat=None if coat is None else slope * coat,
     )
 
 
@@ -241,7 +241,7 @@ def _moments(lit: list[_Lit], base_color: Tensor, shared: Globals) -> tuple[Tens
         x = guide.per_color.detach()[:, None] * base_color
         if guide.shine is not None:
             x = x + guide.shine.detach()[:, None]
-        if guide.film is not None:
-            x = x + shared.coat.weight * guide.film.detach()[:, None]
+        if guide.coat is not None:
+            x = x + shared.coat.weight * guide.coat.detach()[:, None]
         axis, distance = axis + x * guide.log_axis[:, None], distance + x * guide.log_distance[:, None]
     return axis, distance

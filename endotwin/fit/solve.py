@@ -9,18 +9,16 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 
-from endotwin.casting import Caster
 from endotwin.effects import Decision, Effects
-from endotwin.effects.decide import decide
-from endotwin.effects.price import priced
 from endotwin.errors import SequenceError
-from endotwin.fit.film import judged as judged_coat
+from endotwin.evidence.coat import judged as judged_coat
+from endotwin.evidence.decide import decide
 from endotwin.fit.gauss_newton import (
     ROUGHNESS_MEAN,
     GaussNewton,
@@ -29,20 +27,24 @@ from endotwin.fit.gauss_newton import (
     darkest,
     roughness_to_raw,
 )
+from endotwin.fit.hashgrid import HashGrid, HashOperator
 from endotwin.fit.lighting import Relighting, lit
 from endotwin.fit.model import Globals, at_pixels
-from endotwin.fit.pace import ITERATIONS, LIGHT, Pace
-from endotwin.fit.samples import THREADS, Samples, drawn, gather
-from endotwin.fit.start import ALBEDO_TOP, BRIGHT, Start, closed_form, start_at
 from endotwin.fit.tilt import tilted
-from endotwin.fit.unit import unit_mm
 from endotwin.fit.within import Within
-from endotwin.hashgrid import HashGrid, HashOperator
-from endotwin.shading import F0_DIELECTRIC
+from endotwin.light.shading import F0_DIELECTRIC
+from endotwin.pixels.length_unit import unit_mm
+from endotwin.pixels.pace import ITERATIONS, LIGHT, Pace
+from endotwin.pixels.samples import Samples, drawn, gather
+from endotwin.pixels.start import ALBEDO_TOP, BRIGHT, Start, closed_form, start_at
+from endotwin.run.threads import THREADS
 from endotwin.surface import Surface
+from endotwin.surface.casting import Caster
 from endotwin.twin import Light, Materials, Response, Twin
 
 logger = logging.getLogger("endotwin")
+
+Price = Callable[[Twin, Caster], Twin]
 
 LIGHT_CELL_MM = 1.6
 LIGHT_COARSEST_MM = 12.0
@@ -91,9 +93,9 @@ class _Cost:
     pixels: int
 
 
-def fit_twin(twin: Twin, pace: Pace, seed: int, states: Mapping[str, str]) -> Twin:
+def fit_twin(twin: Twin, pace: Pace, seed: int, states: Mapping[str, str], price: Price) -> Twin:
     """Fit as the module says, in the time that ``pace`` gives, with effects as ``states`` say (auto unless
-    named).
+    named), whose prices in its decisions are those that ``price`` finds.
 
     Raises:
         SequenceError: the training photos show nothing of the surface.
@@ -153,7 +155,7 @@ def fit_twin(twin: Twin, pace: Pace, seed: int, states: Mapping[str, str]) -> Tw
         decisions = {**decided.decisions, "coat": coat}
         if "interreflection" in decided.effects and not relighting.bounces:
             decisions["interreflection"] = _without_bounce(decisions["interreflection"])
-        fitted = priced(_fitted(twin, state, relighting.effects, decisions), caster)
+        fitted = price(_fitted(twin, state, relighting.effects, decisions), caster)
     return fitted.with_record(
         fit={"method": "twin", "undetermined": list(start.undetermined), **stopwatch.to_dict()}
     )
@@ -209,7 +211,7 @@ def _find_light(
         material = at_pixels(solver.samples, solver.triangles, state.materials)
         shared, noise = state.shared, solver.noise(state)
         if number == (0 if coat == "on" else COAT_STEP):
-            layer, judged = judged_coat(within, material, shared, noise, coat)
+            layer, judged = judged_coat(within.highlights(material, shared, noise), coat)
             shared = replace(shared, coat=layer)
         if relighting.bounces:
             solver.held = (*start.undetermined, "L0", *(("albedo scale",) * (number < HOLD_STEPS)))

@@ -16,16 +16,17 @@ from torch import Tensor
 from endotwin.effects import Effects
 from endotwin.fit.gauss_newton import HUBER, TEMPER, GaussNewton, State, conjugate_gradients
 from endotwin.fit.model import at_pixels, predict
-from endotwin.fit.normal import CHUNK, MeshPattern, Residual, add_products, pairs_of
-from endotwin.fit.samples import Samples
-from endotwin.guides import guided
-from endotwin.incidence import COS_MIN, dot, unit
+from endotwin.fit.normal_equations import CHUNK, MeshPattern, Residual, add_products, pairs_of
+from endotwin.light.guides import guided
+from endotwin.light.incidence import COS_MIN
+from endotwin.pixels.samples import Samples
+from endotwin.surface.vectors import dot, unit
 from endotwin.twin import Twin
 
 SPREAD_DEG = 0.5
 """Standard deviation of a mesh normal's error, along each axis."""
 
-STEP = 2e-3
+TILT_STEP = 2e-3
 """Step of the finite differences, in radians."""
 
 AXIS_PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
@@ -86,8 +87,8 @@ def _assembled(
         axes = [towards] if part.guides is None else [towards, np.cross(normal, towards)]
         slopes = []
         for axis in axes:
-            seen = _seen(part, unit(normal + np.float32(STEP) * axis), view, effects)
-            slopes.append((predict(seen, material, state.shared) - predicted) / STEP)
+            seen = _seen(part, unit(normal + np.float32(TILT_STEP) * axis), view, effects)
+            slopes.append((predict(seen, material, state.shared) - predicted) / TILT_STEP)
         axis, slope = _steepest(axes, slopes)
         residual = Residual.of(part, predicted, width)
         weight = (residual.weight * slope * slope).sum(dim=1).numpy()

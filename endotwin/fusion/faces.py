@@ -17,7 +17,7 @@ from endotwin.cameras import Camera, Pinhole
 SINGLE_FACE_TAN = 1.75
 """A field of view within ±60° about the axis fits one face; a wider one is split along a cube's sides."""
 
-JUMP = 0.02
+BLEND_STEP = 0.02
 """Relative step between neighbouring distances above which a face takes the nearest one and blends
 nothing."""
 
@@ -50,7 +50,7 @@ class Face:
         (NaN = none)."""
         near = distance_mm.reshape(-1)[self.corners]
         low, high = near.min(axis=0), near.max(axis=0)
-        smooth = high - low <= JUMP * low
+        smooth = high - low <= BLEND_STEP * low
         value = np.where(smooth, np.einsum("kp,kp->p", self.weights, near), near[0])
         depth = np.zeros(self.width * self.height, np.float32)
         depth[self.pixel] = np.nan_to_num(value * self.depth_ratio)

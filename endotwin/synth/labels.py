@@ -7,13 +7,14 @@ from functools import cached_property
 
 import numpy as np
 
-from endotwin.casting import Caster, Correspondences
 from endotwin.effects.exposure import following
 from endotwin.errors import OptionError
-from endotwin.incidence import to_camera
-from endotwin.render import Renderer, View, laid_out
+from endotwin.light.incidence import to_camera
+from endotwin.render import Renderer, View
+from endotwin.render.renderer import laid_out
 from endotwin.surface import Surface
-from endotwin.synth.flow import flow_to, hides_surface, seen_from, surface_points
+from endotwin.surface.casting import Caster, Correspondences, surface_points
+from endotwin.synth.flow import flow_to, hides_surface, seen_from
 from endotwin.synth.job import Job
 from endotwin.synth.photograph import photographed
 

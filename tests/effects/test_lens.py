@@ -8,7 +8,7 @@ import torch
 
 from endotwin.cameras import CALIBRATIONS, Fisheye, Pinhole
 from endotwin.effects.lens import WHOLE_FIELD_DEG, Lens
-from endotwin.readers import open_sequence
+from endotwin.sequence.readers import open_sequence
 
 PINHOLE = Pinhole(160, 120, 70.0, 70.0, 82.0, 57.0)
 FISHEYE = Fisheye(160, 120, 60.0, 60.0, 82.0, 57.0)

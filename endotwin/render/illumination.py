@@ -1,0 +1,171 @@
+"""What lights a twin's surface in one view: the light at the lens or guides beside it, shadows, bounced
+light."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from endotwin.effects.coat import F0_WATER
+from endotwin.light import shading
+from endotwin.light.guides import AT_LENS, COSINE, Guided, guided, log_axis, visible_from
+from endotwin.light.incidence import COS_MIN, incidence_on
+from endotwin.light.radiosity import Radiosity
+from endotwin.surface.casting import Caster, Correspondences
+from endotwin.twin import Twin
+
+
+class Illumination:
+    """The light of one twin; makes only what the twin's effects ask for.
+
+    Args:
+        before: that of another edit of the same twin; what the edits have in common is not made again. Form
+            factors are kept through edits that have no use for them.
+    """
+
+    def __init__(self, twin: Twin, caster: Caster, before: Illumination | None = None):
+        self.twin = twin
+        self._caster = caster
+        self._radiosity = before._radiosity if before else None
+        self._albedo = None
+        if twin.effects.bounce > 0:
+            cell_mm = twin.effects["interreflection"].cell_mm
+            if self._radiosity is None or self._radiosity.cell_mm != cell_mm:
+                self._radiosity = Radiosity(twin.surface, caster, cell_mm)
+            elif before.twin.materials is twin.materials:
+                self._albedo = before._albedo
+            if self._albedo is None:
+                self._albedo = self._radiosity.mean(_albedo_of_triangles(twin))
+
+    @property
+    def nbytes(self) -> int:
+        """Memory of what is kept between views, bytes."""
+        return 0 if self._radiosity is None else self._radiosity.nbytes
+
+    def at(self, T_world_camera: np.ndarray) -> ViewLight:
+        """The light of the view from ``T_world_camera`` [4, 4]."""
+        T_local_camera = self.twin.surface.to_local(T_world_camera)
+        irradiance = None if self._albedo is None else self._bounced(T_local_camera)
+        return ViewLight(self.twin, self._caster, T_local_camera, irradiance)
+
+    def _bounced(self, T_local_camera: np.ndarray) -> np.ndarray:
+        """Indirect irradiance of the vertices, float32 [V, 3], with L0 = 1."""
+        light, effects, radiosity = self.twin.light, self.twin.effects, self._radiosity
+        lamps = [
+            radiosity.lamp(T_local_camera, np.asarray(guide), effects.profile)
+            for guide in effects.guides_mm or AT_LENS
+        ]
+        direct = radiosity.direct(lamps, light.n, light.q).mean(axis=1, keepdims=True)
+        return radiosity.to_vertex @ (effects.bounce * radiosity.indirect(direct, self._albedo)[:, 0])
+
+
+@dataclass(frozen=True)
+class ViewLight:
+    """The light of one view.
+
+    Attributes:
+        T_local_camera: the pose in the surface's frame, float64 [4, 4].
+        irradiance: what other tissue throws on each vertex, float32 [V, 3], with L0 = 1; None: nothing.
+    """
+
+    twin: Twin
+    caster: Caster
+    T_local_camera: np.ndarray
+    irradiance: np.ndarray | None
+
+    def radiance(
+        self, hits: Correspondences, directions: np.ndarray, normals: np.ndarray, material: Tensor
+    ) -> tuple[Tensor, np.ndarray | None]:
+        """Radiance of hits.
+
+        Args:
+            directions: unit viewing rays of all pixels, float32 [..., 3]. normals: float32 [N, 3]; both in
+                the camera frame. material: base colour, roughness and metallic of the hits, [N, 5].
+
+        Returns:
+            float32 [N, 3]; and which guides each point sees, float32 [N, K] (None where no shadow is cast).
+        """
+        diffuse = shading.diffuse(material[:, :3], material[:, 4])
+        visible = None
+        if self.twin.effects.guides_mm is None:
+            x = self._at_lens(hits, directions, normals, diffuse, material[:, 3])
+        else:
+            points_mm = directions.reshape(-1, 3).take(hits.pixel, axis=0) * hits.distance_mm[:, None]
+            guides_mm = np.asarray(self.twin.effects.guides_mm, np.float32)
+            if "shadows" in self.twin.effects:
+                visible = visible_from(self.caster, self.T_local_camera, points_mm, guides_mm)
+            lit = guided(points_mm, normals, guides_mm, self.twin.effects.profile, visible)
+            cos_o = _cos_o(hits, directions, normals)
+            x = self._beside_lens(lit, cos_o, diffuse, material[:, 3])
+        if self.irradiance is not None:
+            bounced = torch.from_numpy(hits.interpolate(self.twin.surface, self.irradiance))
+            cos_o = _cos_o(hits, directions, normals)
+            glossy = shading.specular_of_even_light(cos_o, material[:, 3], self.twin.materials.f0)[:, None]
+            x = x + bounced * (diffuse + glossy / math.pi) * (2 * math.pi * self.twin.light.L0)
+        return x, visible
+
+    def _at_lens(
+        self,
+        hits: Correspondences,
+        directions: np.ndarray,
+        normals: np.ndarray,
+        diffuse: Tensor,
+        roughness: Tensor,
+    ) -> Tensor:
+        geometry = incidence_on(normals, hits, directions)
+        cos, sin2, cone, distance = (torch.from_numpy(value) for value in vars(geometry).values())
+        if self.twin.effects.profile != COSINE:
+            cone = torch.from_numpy(log_axis(np.exp(geometry.log_cos_axis), self.twin.effects.profile))
+        strength = self._strength(cone, distance) * cos
+        if self.twin.materials.diffuse == "burley":
+            diffuse = diffuse * shading.burley(cos, cos, torch.ones_like(cos), roughness)[:, None]
+        for f0, rough in self._lobes(roughness):
+            diffuse = diffuse + f0 * shading.specular_colocated(cos, sin2, rough)[:, None]
+        return diffuse * strength[:, None]
+
+    def _beside_lens(self, lit: Guided, cos_o: Tensor, diffuse: Tensor, roughness: Tensor) -> Tensor:
+        count = lit.cos_i.shape[1]
+        x = torch.zeros_like(diffuse)
+        for k in range(count):
+            cos_i = lit.cos_i[:, k]
+            answer = diffuse
+            if self.twin.materials.diffuse == "burley":
+                answer = answer * shading.burley(cos_i, cos_o, lit.cos_d[:, k], roughness)[:, None]
+            for f0, rough in self._lobes(roughness):
+                answer = answer + f0 * shading.specular_lobe(cos_i, cos_o, lit.sin2_m[:, k], rough)[:, None]
+            strength = self._strength(lit.log_axis[:, k], lit.log_distance[:, k])
+            x += answer * (strength * cos_i / count)[:, None]
+        return x
+
+    def _strength(self, cone: Tensor, distance: Tensor) -> Tensor:
+        """2π·L of the points, [N]."""
+        light = self.twin.light
+        log_L0 = math.log(max(light.L0, 1e-30))
+        return torch.exp(shading.log_spotlight(log_L0, light.n, light.q, cone, distance)) * (2 * math.pi)
+
+    def _lobes(self, roughness: Tensor) -> list[tuple[float, Tensor]]:
+        """f0 and roughness [N] of each specular lobe."""
+        lobes = [(self.twin.materials.f0, roughness)] if self.twin.materials.f0 > 0 else []
+        if "coat" in self.twin.effects:
+            coat = self.twin.effects["coat"]
+            lobes.append((coat.weight * F0_WATER, torch.full_like(roughness, coat.roughness)))
+        return lobes
+
+
+def _albedo_of_triangles(twin: Twin) -> np.ndarray:
+    """Share of light from all around that each triangle sends back, float32 [F, 3]."""
+    materials, triangles = twin.materials, twin.surface.triangles
+    glossy = shading.specular_albedo(torch.from_numpy(materials.roughness), materials.f0).numpy()
+    answer = materials.base_color * (1 - materials.metallic)[:, None] + glossy[:, None]
+    corners = [answer.take(triangles[:, k], axis=0) for k in range(3)]
+    return sum(corners) / np.float32(3)
+
+
+def _cos_o(hits: Correspondences, directions: np.ndarray, normals: np.ndarray) -> Tensor:
+    """n·wo of hits, float32 [N], at least COS_MIN."""
+    view = directions.reshape(-1, 3).take(hits.pixel, axis=0)
+    return torch.from_numpy(np.clip(-(normals * view).sum(axis=1), COS_MIN, 1))

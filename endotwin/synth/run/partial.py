@@ -1,0 +1,118 @@
+"""The unfinished dataset beside its place: what is done stays done, however the run ends."""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from endotwin.errors import OutputError
+from endotwin.run.output import DATASET, check_free
+from endotwin.synth.run.shard import DATA, DONE
+
+JOB, LOCK, OLD = "job.json", "lock", "old"
+
+
+class Partial:
+    """The folder ``DATASET.partial``: ``data`` (the dataset to be), ``done`` (a mark a shard), ``job.json``.
+
+    Made when a run begins, gone when the dataset is whole. A run that is killed leaves it, and the same
+    command finds it. At the end ``data`` is renamed to its place, and only then is the rest removed,
+    ``job.json`` last: so the same command can tell at any moment how far it came.
+    """
+
+    def __init__(self, out: Path):
+        self.out = out
+        self.path = partial_path(out)
+        self._missing = [folder for folder in self.path.parents if not folder.exists()]
+
+    @contextmanager
+    def claimed(self, digest: str, overwrite: bool) -> Iterator[bool]:
+        """Hold the folder for the job of this digest; gives whether its dataset is whole already.
+
+        Raises:
+            OutputError: the dataset exists, another job or another run holds the folder, or it cannot be
+            made.
+        """
+        if not self._just_finished(digest):
+            check_free(self.out, overwrite, DATASET)
+        if self.path.exists() and any(self.path.iterdir()) and not (self.path / LOCK).exists():
+            raise OutputError(f"{self.path} is no unfinished dataset; move it away, or choose another name")
+        self.path.mkdir(parents=True, exist_ok=True)
+        with (self.path / LOCK).open("w") as lock:
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError as error:
+                raise OutputError(f"{self.path} is at work in another run; wait for it or end it") from error
+            finished = self._just_finished(digest)
+            if finished:
+                self.remove()
+            elif self._digest() != digest:
+                self._begin(digest, overwrite)
+            yield finished
+
+    @property
+    def data(self) -> Path:
+        """Where the dataset grows."""
+        return self.path / DATA
+
+    def finish(self) -> None:
+        """Put the dataset, now whole, in its place."""
+        if self.out.exists():
+            self._discard(OLD)
+            self.out.rename(self.path / OLD)
+        self.data.rename(self.out)
+        self.remove()
+
+    def remove(self) -> None:
+        """Remove all that is left of the unfinished dataset."""
+        for name in (DATA, OLD, DONE, f"{JOB}.part", JOB, LOCK):
+            self._discard(name)
+        self.path.rmdir()
+        with suppress(OSError):  # not empty: the dataset got its place there, or someone else's is
+            for folder in self._missing:
+                folder.rmdir()
+
+    def _begin(self, digest: str, overwrite: bool) -> None:
+        """Make the folder one of this job; ``job.json``, written last, says that it is."""
+        if self._digest() is not None and not overwrite:
+            raise OutputError(
+                f"{self.path} is an unfinished dataset of another command, twin or version; finish or "
+                f"remove it, or "
+                "pass --overwrite"
+            )
+        for name in (JOB, DATA, OLD, DONE):
+            self._discard(name)
+        for name in (DATA, DONE):
+            (self.path / name).mkdir()
+        beside = self.path / f"{JOB}.part"
+        beside.write_text(json.dumps({"digest": digest}) + "\n")
+        beside.replace(self.path / JOB)
+
+    def _digest(self) -> str | None:
+        """Of the job that left the folder; None where there is none."""
+        try:
+            return json.loads((self.path / JOB).read_text())["digest"]
+        except FileNotFoundError:
+            return None
+        except (OSError, ValueError, KeyError, TypeError):
+            return ""
+
+    def _just_finished(self, digest: str) -> bool:
+        """Whether the run of this job was killed after the dataset got its place."""
+        return self._digest() == digest and self.out.exists() and not self.data.exists()
+
+    def _discard(self, name: str) -> None:
+        entry = self.path / name
+        if entry.is_dir():
+            shutil.rmtree(entry)
+        else:
+            entry.unlink(missing_ok=True)
+
+
+def partial_path(out: Path) -> Path:
+    """Where the unfinished dataset of ``out`` grows."""
+    return out.absolute().with_name(f"{out.name}.partial")
