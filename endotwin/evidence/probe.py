@@ -52,7 +52,7 @@ class Bounced:
     """Indirect irradiance at a probe's pixels, for L0 = 1.
 
     Attributes:
-        log: float32 [N]. by_n, by_q: float32 [N], its derivatives by the light's n and q.
+        log: float32 [N], at the priors of n and q. by_n, by_q: float32 [N], its derivatives by the light's n and q.
         L0: of a light under which tissue of the usual albedo looks as bright as in the photos.
     """
 
@@ -60,6 +60,10 @@ class Bounced:
     by_n: np.ndarray
     by_q: np.ndarray
     L0: float
+
+    def at(self, n: float, q: float) -> np.ndarray:
+        """ln of the irradiance [N] under another n and q, to first order about their priors."""
+        return self.log + (n - PRIOR["n"]) * self.by_n + (q - PRIOR["q"]) * self.by_q
 
 
 @dataclass(frozen=True)
@@ -316,7 +320,7 @@ class LogLight:
         terms = self.log_cos + n * self.log_axis - q * self.log_distance
         by_n, by_q = self.log_axis, -self.log_distance
         if self.bounced is not None:
-            terms = np.c_[terms, self.bounced.log]
+            terms = np.c_[terms, self.bounced.at(n, q)]
             by_n, by_q = np.c_[by_n, self.bounced.by_n], np.c_[by_q, self.bounced.by_q]
         top = terms.max(axis=1, keepdims=True)
         share = np.exp(terms - top)
