@@ -1,7 +1,6 @@
 """Normals that the photos correct."""
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -18,7 +17,7 @@ from endotwin.fit.hashgrid import HashOperator
 from endotwin.fit.model import Globals
 from endotwin.fit.tilt import tilted
 from endotwin.light.incidence import incidence
-from endotwin.pixels.samples import Samples
+from endotwin.pixels.samples import Samples, Views
 from endotwin.render import Renderer
 from endotwin.surface.casting import Caster
 from endotwin.surface.vectors import unit
@@ -69,7 +68,8 @@ def test_with_the_true_materials_disturbed_normals_are_found_again():
             }
         )
     columns = {name: torch.from_numpy(np.concatenate([part[name] for part in parts])) for name in parts[0]}
-    samples = Samples(**columns)[torch.argsort(columns["triangle"], stable=True)]
+    views = Views(camera, np.ones((288, 384), bool), np.arange(len(poses)), surface.to_local(poses))
+    samples = Samples(**columns, views=views)[torch.argsort(columns["triangle"], stable=True)]
     shown = torch.from_numpy(materials.base_color) ** twin.response.gamma
     rough = torch.tensor([roughness_to_raw(float(value)) for value in materials.roughness])
     mean = torch.cat([shown, rough[:, None]], dim=1).float()
@@ -77,9 +77,7 @@ def test_with_the_true_materials_disturbed_normals_are_found_again():
     solver = GaussNewton(samples, surface.triangles, HashOperator.each(len(surface.vertices_mm), 0.4))
     off = np.radians(0.5) * np.random.default_rng(0).normal(size=surface.normals.shape)
     disturbed = unit((surface.normals + off).astype(np.float32))
-    flight = SimpleNamespace(open=lambda: SimpleNamespace(T_world_camera=poses))
-    scene = SimpleNamespace(camera=camera, source=flight)
-    found = tilted(tilted(disturbed, solver, state, scene, Effects()), solver, state, scene, Effects())
+    found = tilted(tilted(disturbed, solver, state, Effects()), solver, state, Effects())
     seen = np.bincount(surface.triangles[samples.triangle.numpy()].ravel(), minlength=len(found)) > 60
 
     def off_deg(normals: np.ndarray) -> float:

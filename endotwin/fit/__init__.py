@@ -8,6 +8,7 @@ from pathlib import Path
 from endotwin.config import METHODS, STANDARD, FitConfig
 from endotwin.errors import OptionError
 from endotwin.pixels.pace import Pace
+from endotwin.pixels.samples import Views
 from endotwin.surface.casting import Caster
 from endotwin.twin import Twin
 
@@ -20,7 +21,7 @@ def fit(
     progress: Callable[[str, int, int], None] | None = None,
     checkpoint: Path | None = None,
     effects: Mapping[str, str] | None = None,
-    price: Callable[[Twin, Caster], Twin] = lambda twin, caster: twin,
+    price: Callable[[Twin, Caster, Views], Twin] = lambda twin, caster, views: twin,
 ) -> Twin:
     """The twin with materials, light and response fitted to its training photos.
 
@@ -31,7 +32,8 @@ def fit(
         progress: called with (label, done, total).
         checkpoint: where ``endopbr`` keeps what it has learned so far, to go on from there if it is stopped.
         effects: auto, on or off by name of the effect, ``twin`` only; auto unless named.
-        price: gives the fitted twin's decisions what each effect costs a rendering, ``twin`` only.
+        price: gives the fitted twin's decisions what each effect costs a rendering of the training views,
+            ``twin`` only.
 
     Raises:
         OptionError: an unknown method, or an option that the method does not have.

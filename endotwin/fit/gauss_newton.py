@@ -39,7 +39,6 @@ COLOR_SPREAD = 0.5
 ROUGHNESS_SPREAD = 0.1
 """Standard deviation of a table entry of a COARSE_MM cell: base colour, roughness."""
 
-ROUGHNESS_MEAN = 0.4
 COARSE_MM = 12.0
 
 GLOBAL_MEAN = (
