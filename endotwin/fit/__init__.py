@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from endotwin.config import METHODS, STANDARD, FitConfig
+from endotwin.effects import RENDERED
 from endotwin.errors import OptionError
 from endotwin.pixels.pace import Pace
 from endotwin.pixels.samples import Views
@@ -36,11 +37,17 @@ def fit(
             ``twin`` only.
 
     Raises:
-        OptionError: an unknown method, or an option that the method does not have.
+        OptionError: an unknown method, an option that the method does not have, or an effect that is only
+            rendered.
         SequenceError: the photos cannot be read, or show nothing of the surface.
     """
     if config.method not in METHODS:
         raise OptionError(f"unknown method '{config.method}'; choose one of: {', '.join(METHODS)}")
+    rendered = [name for name, state in (effects or {}).items() if name in RENDERED and state == "on"]
+    if rendered:
+        raise OptionError(
+            f"{rendered[0]} is rendered and not fitted; ask for it with 'synth --effects {rendered[0]}=on'"
+        )
     if config.method == "twin":
         if epochs is not None:
             raise OptionError(
@@ -49,6 +56,10 @@ def fit(
         from endotwin.fit.solve import fit_twin
 
         return fit_twin(twin, Pace(config, progress), seed, effects or {}, price)
+    if effects:
+        raise OptionError(
+            "--effects belongs to --method twin; endopbr is Han & Wu's model as published, without effects"
+        )
     from endotwin.fit.endopbr import fit_endopbr
 
     return fit_endopbr(twin, config.budget, epochs, seed, progress, checkpoint)

@@ -83,6 +83,11 @@ class State:
         return self.mean if self.operator is None else self.mean + self.operator(self.table)
 
     @property
+    def textured(self) -> bool:
+        """Whether places may differ in their materials: before the first step they do not."""
+        return self.mean.dim() == 2 or bool(self.table.any())
+
+    @property
     def materials(self) -> Tensor:
         """Base colour and roughness of every vertex, [V, 4]."""
         raw = self.raw

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from endotwin.effects import Effects
+from endotwin.effects.gain import Gain
 from endotwin.fit.gauss_newton import HUBER, GaussNewton, State
 from endotwin.fit.model import Globals, at_pixels, slope_by_log_exposure
 from endotwin.fit.normal_equations import Residual
@@ -77,6 +78,8 @@ class Relighting:
     """What of the light depends on the materials, renewed as the fit finds them."""
 
     def __init__(self, surface: Surface, caster: Caster, effects: Effects, views: Views):
+        if "gain" in effects:
+            effects = effects.including(effects["gain"].at(views.frames))
         self.effects = effects
         self._bouncer = Bouncer(surface, caster, effects, views) if effects.bounce else None
 
@@ -101,11 +104,14 @@ class Relighting:
         if self.bounces:
             roughness = at_pixels(samples, solver.triangles, materials[:, 3:])[:, 0]
             samples = self._bouncer.bounced(samples, roughness, materials, solver.triangles, state.shared)
-        if "gain" in self.effects and state.table is not None and bool(state.table.any()):
-            width = HUBER * solver.noise(state)
-            material = at_pixels(samples, solver.triangles, materials)
-            self.effects = regained(samples, material, state.shared, self.effects, width)
+        if "gain" in self.effects:
             samples = exposed(samples, self.effects)
+            if state.textured:
+                solver.relight(samples)
+                width = HUBER * solver.noise(state)
+                material = at_pixels(samples, solver.triangles, materials)
+                self.effects = regained(samples, material, state.shared, self.effects, width)
+                samples = exposed(samples, self.effects)
         if self.needed:
             solver.relight(samples)
 
@@ -135,7 +141,8 @@ class Bouncer:
 
 
 def regained(samples: Samples, material: Tensor, shared: Globals, effects: Effects, width: float) -> Effects:
-    """``effects`` with each frame's gain moved to where its residual is least to first order.
+    """``effects``, whose gain holds all frames of the samples' views, with each frame's gain moved to where
+    its residual is least to first order.
 
     Args:
         material: [N, 4] of the samples. width: of the robust loss, in display values.
@@ -143,10 +150,10 @@ def regained(samples: Samples, material: Tensor, shared: Globals, effects: Effec
     gain = effects["gain"]
     predicted, slope = slope_by_log_exposure(samples, material, shared)
     residual = Residual.of(samples, predicted, width)
-    frame = np.searchsorted(gain.frames, samples.frame.numpy())
+    frame = samples.views.row(samples.frame)
     pull, normal = (
         np.bincount(frame, (residual.weight * slope * other).sum(dim=1).numpy(), len(gain.frames))
         for other in (residual.error, slope)
     )
     log_gain = np.asarray(gain.log_gain) + pull / np.maximum(normal, 1e-12)
-    return effects.including(replace(gain, log_gain=tuple(map(float, log_gain - log_gain.mean()))))
+    return effects.including(Gain.centred(gain.frames, log_gain))

@@ -134,7 +134,7 @@ def fit_twin(twin: Twin, pace: Pace, seed: int, states: Mapping[str, str], price
                 decided.light,
                 decided.gamma,
             )
-        samples = lit(samples, surface, caster, decided.effects)
+        samples = lit(samples, surface, caster, relighting.effects)
     with stopwatch.stage("light"):
         wanted = states.get("coat", "auto") if "specular" in decided.effects else "off"
         count = min(LIGHT_PIXELS, int(LIGHT_SHARE * pace.start_pixels))
