@@ -485,6 +485,8 @@ def test_an_unfitted_twin_has_no_scores_and_no_dataset(fails, endotwin, made, tm
         ["fit", "{made}/twin", "-o", "{new}", "--method", "magic"],
         ["fit", "{made}/twin", "-o", "{new}", "--budget", "0"],
         ["fit", "{made}/twin", "-o", "{new}", "--epochs", "0"],
+        ["fit", "{made}/twin", "-o", "{new}", "--effects", "noise=on"],
+        ["fit", "{made}/twin", "-o", "{new}", "--method", "endopbr", "--effects", "gain=off"],
         ["fit", "{made}/twin", "-o", "{new}", "--seed", "-1"],
         ["eval", "{made}/twin", "--scale", "1e9"],
         ["synth", "{made}/twin", "--trajectory", "jitter:", "-o", "{new}", "--material", "gloss*2"],

@@ -10,8 +10,9 @@ from endotwin.effects.coat import Coat
 from endotwin.fit.gauss_newton import _joint_minimum, conjugate_gradients
 from endotwin.fit.model import BOUNCE_GLOBALS, Globals, at_pixels, linearise, predict
 from endotwin.fit.normal_equations import MeshPattern, Residual, assemble, robust_cost
+from endotwin.light.bounced import Bounce
 from endotwin.light.guides import Guided
-from endotwin.pixels.samples import Bounce, Samples, discontinuities
+from endotwin.pixels.samples import Samples, discontinuities
 from endotwin.pixels.start import DIFFUSE_SIN2
 from endotwin.twin import Light, Response
 

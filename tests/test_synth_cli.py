@@ -100,6 +100,7 @@ def test_progress_shows_frames_a_second():
         (["-o", "{new}", "--vary", "nowhere.yaml"], "nowhere.yaml"),
         (["-o", "{new}", "--clearance", "-1"], "clearance"),
         (["-o", "{new}", "--max-unseen", "2"], "unseen"),
+        (["-o", "{new}", "--effects", "noise=auto"], "noise=on or off"),
         (["-o", "{new}", "--max-distance", "5"], "nowhere"),
         (["-o", "{new}", "--workers", "-1"], "workers"),
         (["--preview", "{new}.jpg"], "png"),

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.sparse import csr_array
+import torch
 
 from endotwin.evidence.probe import Bounced, Hypothesis, Probe
+from endotwin.light.bounced import Albedo, BouncedLight, Places
 from endotwin.light.radiosity import Radiosity
+from endotwin.light.shading import F0_DIELECTRIC, ROUGHNESS_TISSUE, specular_albedo, specular_of_even_light
 from endotwin.pixels.start import PRIOR
 
 CELL = 0.15
@@ -20,8 +22,6 @@ PROBE_ALBEDO = 0.8
 whether light bounces at all."""
 
 FIXED_POINT_ROUNDS = 2
-LIGHT_STEP = 0.05
-"""Step in n and q of the finite differences of the bounced light."""
 
 
 def cell_mm(log_distance: np.ndarray) -> float:
@@ -33,34 +33,35 @@ def bounced(probe: Probe, hypothesis: Hypothesis) -> Bounced:
     """Indirect light at the probe's pixels, with n, q and γ at their priors.
 
     The plain closed form is biased by the bounce. The albedo is that of the photos; it starts without the
-    bounce and is corrected for it in a few fixed-point rounds.
+    bounce and is corrected for it in a few fixed-point rounds. The specular lobe, of the usual tissue, sends
+    its share of the light back, and on to the camera: for each pixel, the irradiance is that under which base
+    colours alone would look as bright.
     """
     n, q, gamma = PRIOR["n"], PRIOR["q"], PRIOR["gamma"]
-    size_mm = PROBE_CELLS * cell_mm(probe.samples.log_distance.numpy())
+    samples, roughness = probe.samples, torch.tensor(ROUGHNESS_TISSUE)
+    size_mm = PROBE_CELLS * cell_mm(samples.log_distance.numpy())
     radiosity = Radiosity(probe.twin.surface, probe.caster, size_mm, PROBE_RAYS)
-    lamps = [
-        [radiosity.lamp(pose, np.asarray(guide), hypothesis.profile) for guide in hypothesis.guides_mm]
-        for pose in probe.T_local_camera
-    ]
-    to_pixel = radiosity.to_points(probe.local_points_mm, probe.local_normals)
-    patch = radiosity.patch_of[probe.samples.triangle.numpy()]
-    linear = (np.maximum(probe.samples.color.numpy(), 1) / 255.0) ** (1 / gamma)
+    light = BouncedLight(radiosity, probe.T_local_camera, hypothesis.guides_mm, hypothesis.profile)
+    places = Places(radiosity.to_points(probe.local_points_mm, probe.local_normals), probe.frame)
+    patch = radiosity.patch_of[samples.triangle.numpy()]
+    linear = (np.maximum(samples.color.numpy(), 1) / 255.0) ** (1 / gamma)
+    glossy = specular_albedo(roughness, F0_DIELECTRIC).numpy()
+    gloss = specular_of_even_light(samples.cos, roughness, F0_DIELECTRIC)
     direct_light = probe.direct_light(hypothesis, n, q)
 
-    def at_pixels(n: float, q: float, albedo: np.ndarray) -> np.ndarray:
-        direct = np.stack([radiosity.direct(frame, n, q).mean(axis=1) for frame in lamps], axis=1)
-        colored = radiosity.indirect(direct, albedo)
-        weighted = (colored * albedo[:, None]).sum(axis=2) / albedo.sum(axis=1)[:, None]
-        return _of_own_frame(to_pixel, weighted, probe.frame)
+    def seen(irradiance: np.ndarray, base_color: np.ndarray) -> np.ndarray:
+        """Irradiance [N, 3] as tissue of base colours [P, 3] shows it, [N]."""
+        color = places.weights @ base_color
+        return (irradiance * (color + gloss.numpy()[:, None])).sum(axis=1) / color.sum(axis=1)
 
-    light = direct_light
+    light_there = direct_light
     for _ in range(FIXED_POINT_ROUNDS):
-        albedo, L0 = _patch_albedo(linear, light, patch, radiosity.count)
-        irradiance = at_pixels(n, q, albedo)
-        light = direct_light + irradiance
-    steps = (irradiance, at_pixels(n + LIGHT_STEP, q, albedo), at_pixels(n, q + LIGHT_STEP, albedo))
-    log, further_n, further_q = (np.log(np.maximum(value, 1e-30)) for value in steps)
-    return Bounced(log, (further_n - log) / LIGHT_STEP, (further_q - log) / LIGHT_STEP, L0)
+        base_color, L0 = _patch_albedo(linear, light_there, patch, radiosity.count)
+        albedo = Albedo(base_color, glossy)
+        light_there = direct_light + seen(light.at(places, n, q, albedo.scaled(0.0)), base_color)
+    found = light.expanded(places, n, q, albedo, gloss)
+    log = np.log(np.maximum(seen(found.irradiance(n, q).numpy(), base_color), 1e-30))
+    return Bounced(log, found.by_n.numpy(), found.by_q.numpy(), L0)
 
 
 def _patch_albedo(
@@ -75,10 +76,3 @@ def _patch_albedo(
     albedo[~seen] = np.median(albedo[seen], axis=0)
     scale = PROBE_ALBEDO / float(np.percentile(albedo[seen].max(axis=1), 98))
     return albedo * scale, 1 / (2 * scale)
-
-
-def _of_own_frame(to_pixel: csr_array, per_patch: np.ndarray, frame: np.ndarray) -> np.ndarray:
-    """Values [P, F] of patches in each frame, interpolated at pixels of frames [N]: [N]."""
-    nearest = to_pixel.indices.reshape(len(frame), -1)
-    weight = to_pixel.data.reshape(len(frame), -1)
-    return (weight * per_patch[nearest, frame[:, None]]).sum(axis=1)

@@ -57,7 +57,8 @@ class Bounced:
     """Indirect irradiance at a probe's pixels, for L0 = 1.
 
     Attributes:
-        log: float32 [N], at the priors of n and q. by_n, by_q: float32 [N], its derivatives by the light's n and q.
+        log: float32 [N], at the priors of n and q. by_n, by_q: float32 [N], its derivatives by the light's
+            n and q.
         L0: of a light under which tissue of the usual albedo looks as bright as in the photos.
     """
 
@@ -174,8 +175,8 @@ class Probe:
     @cached_property
     def T_local_camera(self) -> np.ndarray:
         """Poses of ``frames`` in the surface's frame, float64 [F, 4, 4]."""
-        poses = self.twin.source.open().T_world_camera
-        return np.stack([self.twin.surface.to_local(poses[index]) for index in self.frames])
+        views = self.samples.views
+        return views.T_local_camera[np.searchsorted(views.frames, self.frames)]
 
     @cached_property
     def points_mm(self) -> np.ndarray:

@@ -39,7 +39,6 @@ COLOR_SPREAD = 0.5
 ROUGHNESS_SPREAD = 0.1
 """Standard deviation of a table entry of a COARSE_MM cell: base colour, roughness."""
 
-ROUGHNESS_MEAN = 0.4
 COARSE_MM = 12.0
 
 GLOBAL_MEAN = (0.0, *LIGHT_MEAN, math.log(F0_DIELECTRIC), 0.0)
@@ -75,6 +74,11 @@ class State:
     def raw(self) -> Tensor:
         """θ = θ̄ + A·table, [V, 4]."""
         return self.mean if self.operator is None else self.mean + self.operator(self.table)
+
+    @property
+    def textured(self) -> bool:
+        """Whether places may differ in their materials: before the first step they do not."""
+        return self.mean.dim() == 2 or bool(self.table.any())
 
     @property
     def materials(self) -> Tensor:

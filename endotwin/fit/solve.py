@@ -20,7 +20,6 @@ from endotwin.errors import SequenceError
 from endotwin.evidence.coat import judged as judged_coat
 from endotwin.evidence.decide import decide
 from endotwin.fit.gauss_newton import (
-    ROUGHNESS_MEAN,
     GaussNewton,
     State,
     at_bounds,
@@ -32,10 +31,10 @@ from endotwin.fit.lighting import Relighting, lit
 from endotwin.fit.model import Globals, at_pixels
 from endotwin.fit.tilt import tilted
 from endotwin.fit.within import Within
-from endotwin.light.shading import F0_DIELECTRIC
+from endotwin.light.shading import F0_DIELECTRIC, ROUGHNESS_TISSUE
 from endotwin.pixels.length_unit import unit_mm
 from endotwin.pixels.pace import ITERATIONS, LIGHT, Pace
-from endotwin.pixels.samples import Samples, drawn, gather
+from endotwin.pixels.samples import Samples, Views, drawn, gather
 from endotwin.pixels.start import ALBEDO_TOP, BRIGHT, Start, closed_form, start_at
 from endotwin.run.threads import THREADS
 from endotwin.surface import Surface
@@ -44,7 +43,7 @@ from endotwin.twin import Light, Materials, Response, Twin
 
 logger = logging.getLogger("endotwin")
 
-Price = Callable[[Twin, Caster], Twin]
+Price = Callable[[Twin, Caster, Views], Twin]
 
 LIGHT_CELL_MM = 1.6
 LIGHT_COARSEST_MM = 12.0
@@ -126,7 +125,7 @@ def fit_twin(twin: Twin, pace: Pace, seed: int, states: Mapping[str, str], price
     with stopwatch.stage("effects"):
         caster = caster.threaded(THREADS)
         decided = decide(samples[every], twin, caster, states)
-        relighting = Relighting(twin, caster, decided.effects, np.unique(samples.frame.numpy()))
+        relighting = Relighting(surface, caster, decided.effects, samples.views)
         if decided.light is not None:
             start = start_at(
                 samples[telling],
@@ -135,7 +134,7 @@ def fit_twin(twin: Twin, pace: Pace, seed: int, states: Mapping[str, str], price
                 decided.light,
                 decided.gamma,
             )
-        samples = lit(samples, twin, caster, decided.effects)
+        samples = lit(samples, surface, caster, relighting.effects)
     with stopwatch.stage("light"):
         wanted = states.get("coat", "auto") if "specular" in decided.effects else "off"
         count = min(LIGHT_PIXELS, int(LIGHT_SHARE * pace.start_pixels))
@@ -155,7 +154,7 @@ def fit_twin(twin: Twin, pace: Pace, seed: int, states: Mapping[str, str], price
         decisions = {**decided.decisions, "coat": coat}
         if "interreflection" in decided.effects and not relighting.bounces:
             decisions["interreflection"] = _without_bounce(decisions["interreflection"])
-        fitted = price(_fitted(twin, state, relighting.effects, decisions), caster)
+        fitted = price(_fitted(twin, state, relighting.effects, decisions), caster, samples.views)
     return fitted.with_record(
         fit={"method": "twin", "undetermined": list(start.undetermined), **stopwatch.to_dict()}
     )
@@ -188,7 +187,7 @@ def _find_light(
         out_of_time=pace.light_is_over,
     )
     shown = torch.from_numpy(start.base_color) ** start.response.gamma
-    mean = torch.cat([shown.median(dim=0).values, torch.tensor([roughness_to_raw(ROUGHNESS_MEAN)])])
+    mean = torch.cat([shown.median(dim=0).values, torch.tensor([roughness_to_raw(ROUGHNESS_TISSUE)])])
     table = torch.zeros(operator.forward_csr.shape[1], 4)
     effects = relighting.effects
     options = {"specular": "specular" in effects, "bounce": relighting.bounces}
@@ -268,7 +267,7 @@ def _find_detail(
     for number in range(pace.plan.tilts):
         if pace.left(ITERATIONS) <= step_s / 2:
             break
-        normals = tilted(normals, solver, state, twin, relighting.effects)
+        normals = tilted(normals, solver, state, relighting.effects)
         pace.report("tilt the normals", number + 1, pace.plan.tilts)
     return state, normals
 

@@ -21,7 +21,6 @@ from endotwin.light.guides import guided
 from endotwin.light.incidence import COS_MIN
 from endotwin.pixels.samples import Samples
 from endotwin.surface.vectors import dot, unit
-from endotwin.twin import Twin
 
 SPREAD_DEG = 0.5
 """Standard deviation of a mesh normal's error, along each axis."""
@@ -32,14 +31,12 @@ TILT_STEP = 2e-3
 AXIS_PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 
 
-def tilted(
-    normals: np.ndarray, solver: GaussNewton, state: State, twin: Twin, effects: Effects
-) -> np.ndarray:
+def tilted(normals: np.ndarray, solver: GaussNewton, state: State, effects: Effects) -> np.ndarray:
     """The unit ``normals`` [V, 3] of the vertices, tilted to what the samples of ``solver`` show."""
     samples, pattern = solver.samples, solver.pattern
     noise = solver.noise(state)
     scale = 1 / (noise**2 * TEMPER)
-    sums, right = _assembled(normals, samples, pattern, solver.triangles, state, twin, effects, HUBER * noise)
+    sums, right = _assembled(normals, samples, pattern, solver.triangles, state, effects, HUBER * noise)
     blocks = {pair: pattern.matrix(sums[:, :, k] * scale) for k, pair in enumerate(AXIS_PAIRS)}
     blocks |= {(j, i): block for (i, j), block in blocks.items()}
     precision = 1 / np.radians(SPREAD_DEG) ** 2
@@ -62,7 +59,6 @@ def _assembled(
     pattern: MeshPattern,
     triangles: Tensor,
     state: State,
-    twin: Twin,
     effects: Effects,
     width: float,
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -73,11 +69,11 @@ def _assembled(
     """
     count = len(pattern.corners)
     sums, right = np.zeros((count, 6, 6), np.float32), np.zeros((count, 3, 3), np.float32)
-    rotations = twin.source.open().T_world_camera[:, :3, :3].astype(np.float32)
-    rays = twin.camera.pixel_directions.reshape(-1, 3)
+    rotations = samples.views.T_local_camera[:, :3, :3].astype(np.float32)
+    rays = samples.views.camera.pixel_directions.reshape(-1, 3)
     materials, corner_normals = state.materials, torch.from_numpy(normals)
     for start, part in zip(range(0, len(samples), CHUNK), samples.chunks(CHUNK), strict=True):
-        rotation, view = rotations[part.frame.numpy()], rays[part.pixel.numpy()]
+        rotation, view = rotations[part.views.row(part.frame)], rays[part.pixel.numpy()]
         normal = at_pixels(part, triangles, corner_normals).numpy()
         normal = unit(np.einsum("na,nab->nb", normal, rotation))
         material = at_pixels(part, triangles, materials)

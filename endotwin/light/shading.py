@@ -20,6 +20,9 @@ from torch import Tensor
 F0_DIELECTRIC = 0.04
 """Reflectance of tissue at normal incidence: ((1.5 - 1) / (1.5 + 1))², Burley's ``specular`` 0.5."""
 
+ROUGHNESS_TISSUE = 0.4
+"""Roughness of tissue where nothing tells it yet."""
+
 ROUGHNESS_MIN = 0.045
 """Least roughness: α = r² = 0.002 keeps the GGX peak 1/(π α²) and its slope within float32."""
 

@@ -9,17 +9,28 @@ import numpy as np
 from endotwin.surface import Surface
 
 TYPICAL_MM = 24.0
-"""An endoscope sees the wall of a colon from about here: 8 to 68 mm are one unit."""
+"""An endoscope sees the wall of a colon from about here."""
 
-BASE = 8
-"""Units are powers of it. Tissue varies over millimetres however near the camera is, so the fit's lengths
-stay in millimetres for whatever may be a colon; and a power of two scales floating point exactly."""
+COLON_MM = (8.0, 68.0)
+"""Seen from between these, a scene may be a colon. Tissue varies over millimetres however near the camera is,
+so that the fit's lengths stay in millimetres there."""
+
+CATCHING_UP = 2.0
+"""Beyond a colon's distances the unit grows so many times faster than they do, until it has caught up."""
 
 
 def unit_mm(surface: Surface) -> float:
-    """The factor, a power of ``BASE``, by which ``surface`` was seen from farther away than a colon is."""
+    """The factor by which ``surface`` was seen from farther away than a colon is: 1 for whatever may be one.
+
+    Elsewhere it is the power of two, which scales floating point exactly, next to distance / TYPICAL_MM; just
+    beyond a colon's distances one that is nearer to 1, so that it never steps by more than 2.
+    """
     nearest_mm = surface.nearest_mm[surface.seen_by > 0]
-    if not len(nearest_mm):
+    low_mm, high_mm = COLON_MM
+    from_mm = max(float(np.median(nearest_mm)), 1e-30) if len(nearest_mm) else TYPICAL_MM
+    beyond = max(low_mm / from_mm, from_mm / high_mm)
+    if beyond <= 1:
         return 1.0
-    ratio = float(np.median(nearest_mm)) / TYPICAL_MM
-    return float(BASE ** round(math.log(max(ratio, 1e-30), BASE)))
+    doublings = math.log2(from_mm / TYPICAL_MM)
+    catching_up = CATCHING_UP * math.log2(beyond) + 0.5
+    return 2.0 ** math.copysign(round(min(abs(doublings), catching_up)), doublings)

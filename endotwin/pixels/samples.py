@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from endotwin.cameras.base import Camera
+from endotwin.light.bounced import Bounce
 from endotwin.light.guides import Guided
 from endotwin.light.incidence import incidence
 from endotwin.pixels.length_unit import unit_mm
@@ -34,23 +36,23 @@ logger = logging.getLogger("endotwin")
 
 
 @dataclass(frozen=True)
-class Bounce:
-    """Indirect irradiance at N pixels, E = L0·exp(log + n·by_n + q·by_q + ln κ·by_scale), κ a factor on
-    all albedo.
+class Views:
+    """The photos that samples come from.
 
     Attributes:
-        log: float32 [N, 3]. by_n, by_q, by_scale: float32 [N].
-        gloss: float32 [N], share of it that the specular lobe sends to the camera.
+        camera: that took them. lens_mask: bool [H, W], pixels within the lens circle.
+        frames: int [F], their numbers in the sequence, ascending.
+        T_local_camera: float64 [F, 4, 4], their poses in the surface's frame.
     """
 
-    log: Tensor
-    by_n: Tensor
-    by_q: Tensor
-    by_scale: Tensor
-    gloss: Tensor
+    camera: Camera
+    lens_mask: np.ndarray
+    frames: np.ndarray
+    T_local_camera: np.ndarray
 
-    def __getitem__(self, index) -> Bounce:
-        return Bounce(**{name: value[index] for name, value in vars(self).items()})
+    def row(self, frame: Tensor) -> np.ndarray:
+        """Where frames [N] stand among ``frames``, int [N]."""
+        return np.searchsorted(self.frames, frame.numpy())
 
 
 @dataclass(frozen=True)
@@ -65,6 +67,7 @@ class Samples:
         guides: how guides beside the lens light the pixels; None: the light is at the lens.
         bounce: what other tissue throws on them; None: nothing.
         log_exposure: float32 [N], ln of gain and vignetting; None: 0.
+        views: the photos; None for samples that no photo showed.
     """
 
     triangle: Tensor
@@ -79,13 +82,14 @@ class Samples:
     guides: Guided | None = None
     bounce: Bounce | None = None
     log_exposure: Tensor | None = None
+    views: Views | None = None
 
     def __len__(self) -> int:
         return len(self.triangle)
 
     def __getitem__(self, index) -> Samples:
-        chosen = {name: value if value is None else value[index] for name, value in vars(self).items()}
-        return Samples(**chosen)
+        rows = {name: value for name, value in vars(self).items() if value is not None and name != "views"}
+        return replace(self, **{name: value[index] for name, value in rows.items()})
 
     def thinned(self, count: int, generator: np.random.Generator) -> Samples:
         """About ``count`` of the samples, drawn evenly at random; all of them if there are no more."""
@@ -136,7 +140,10 @@ def gather(twin: Twin, pace: Pace, seed: int, caster: Caster) -> Samples:
     parts = [part for part, tells in zip(parts, shows, strict=True) if tells or not any(shows)]
     columns = [name for name, value in vars(parts[0]).items() if value is not None]
     joined = Samples(**{name: torch.cat([getattr(part, name) for part in parts]) for name in columns})
-    return joined[torch.argsort(joined.triangle, stable=True)]
+    shown = np.unique(joined.frame.numpy())
+    T_local_camera = twin.surface.to_local(sequence.T_world_camera[shown])
+    views = Views(twin.camera, sequence.lens_mask, shown, T_local_camera)
+    return replace(joined[torch.argsort(joined.triangle, stable=True)], views=views)
 
 
 def _shown(part: Samples) -> float:

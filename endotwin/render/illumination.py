@@ -12,6 +12,7 @@ from torch import Tensor
 
 from endotwin.effects.coat import F0_WATER
 from endotwin.light import shading
+from endotwin.light.bounced import Albedo, BouncedLight, Places
 from endotwin.light.guides import AT_LENS, COSINE, Guided, guided, log_axis, visible_from
 from endotwin.light.incidence import COS_MIN, incidence_on
 from endotwin.light.radiosity import Radiosity
@@ -39,7 +40,7 @@ class Illumination:
             elif before.twin.materials is twin.materials:
                 self._albedo = before._albedo
             if self._albedo is None:
-                self._albedo = self._radiosity.mean(_albedo_of_triangles(twin))
+                self._albedo = _albedo(twin, self._radiosity)
 
     @property
     def nbytes(self) -> int:
@@ -54,13 +55,11 @@ class Illumination:
 
     def _bounced(self, T_local_camera: np.ndarray) -> np.ndarray:
         """Indirect irradiance of the vertices, float32 [V, 3], with L0 = 1."""
-        light, effects, radiosity = self.twin.light, self.twin.effects, self._radiosity
-        lamps = [
-            radiosity.lamp(T_local_camera, np.asarray(guide), effects.profile)
-            for guide in effects.guides_mm or AT_LENS
-        ]
-        direct = radiosity.direct(lamps, light.n, light.q).mean(axis=1, keepdims=True)
-        return radiosity.to_vertex @ (effects.bounce * radiosity.indirect(direct, self._albedo)[:, 0])
+        light, effects, to_vertex = self.twin.light, self.twin.effects, self._radiosity.to_vertex
+        guides_mm = effects.guides_mm or AT_LENS
+        bounced = BouncedLight(self._radiosity, T_local_camera[None], guides_mm, effects.profile)
+        places = Places(to_vertex, np.zeros(to_vertex.shape[0], np.int32))
+        return effects.bounce * bounced.at(places, light.n, light.q, self._albedo)
 
 
 @dataclass(frozen=True)
@@ -156,13 +155,12 @@ class ViewLight:
         return lobes
 
 
-def _albedo_of_triangles(twin: Twin) -> np.ndarray:
-    """Share of light from all around that each triangle sends back, float32 [F, 3]."""
-    materials, triangles = twin.materials, twin.surface.triangles
-    glossy = shading.specular_albedo(torch.from_numpy(materials.roughness), materials.f0).numpy()
-    answer = materials.base_color * (1 - materials.metallic)[:, None] + glossy[:, None]
-    corners = [answer.take(triangles[:, k], axis=0) for k in range(3)]
-    return sum(corners) / np.float32(3)
+def _albedo(twin: Twin, radiosity: Radiosity) -> np.ndarray:
+    """Share of light from all around that each patch sends back, float [P, 3]."""
+    materials = twin.materials
+    diffuse = torch.from_numpy(materials.base_color * (1 - materials.metallic)[:, None])
+    roughness = torch.from_numpy(materials.roughness)
+    return Albedo.of(radiosity, diffuse, roughness, materials.f0, twin.surface.triangles).scaled(0.0)
 
 
 def _cos_o(hits: Correspondences, directions: np.ndarray, normals: np.ndarray) -> Tensor:

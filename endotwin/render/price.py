@@ -9,10 +9,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from endotwin.effects import RENDERED, Decision, effect_class
+from endotwin.effects import RENDERED, Decision
+from endotwin.effects.lens import Lens
 from endotwin.render.renderer import Renderer
 
 if TYPE_CHECKING:
+    from endotwin.pixels.samples import Views
     from endotwin.surface.casting import Caster
     from endotwin.twin import Twin
 
@@ -23,17 +25,18 @@ LEAST_S = 0.3
 """Renderings are repeated for so long: the best of several small ones, a single large one."""
 
 
-def priced(twin: Twin, caster: Caster) -> Twin:
-    """``twin`` with the price of each effect that is on in its decisions, and those only rendered in them
-    too."""
-    decisions = {**twin.decisions, **_rendered(twin)}
+def priced(twin: Twin, caster: Caster, views: Views) -> Twin:
+    """``twin`` with the price of each effect that is on in its decisions, by the middle one of ``views``, and
+    those only rendered in them too."""
+    decisions = {**twin.decisions, **_rendered(views)}
+    pose = twin.surface.to_world(views.T_local_camera[len(views.frames) // 2])
     dear = [name for name in twin.effects if name in decisions and name not in FREE]
     if dear:
         whole = Renderer(twin, caster=caster)
-        whole_ms = frame_ms(whole)
+        whole_ms = frame_ms(whole, pose)
         for name in dear:
             gone = {"offset": ("offset", "shadows")}.get(name, (name,))
-            other_ms = frame_ms(whole.edited(replace(twin, effects=twin.effects.without(gone))))
+            other_ms = frame_ms(whole.edited(replace(twin, effects=twin.effects.without(gone))), pose)
             decisions[name] = replace(
                 decisions[name],
                 render_ms=round(max(0.0, whole_ms - other_ms), 1),
@@ -42,10 +45,9 @@ def priced(twin: Twin, caster: Caster) -> Twin:
     return replace(twin, decisions=decisions)
 
 
-def frame_ms(renderer: Renderer) -> float:
-    """Milliseconds of the sequence's middle frame."""
-    pose = _middle_pose(renderer.twin)
-    return best_ms(lambda: renderer.view(pose))
+def frame_ms(renderer: Renderer, T_world_camera: np.ndarray) -> float:
+    """Milliseconds of the view from ``T_world_camera`` [4, 4]."""
+    return best_ms(lambda: renderer.view(T_world_camera))
 
 
 def best_ms(render: Callable[[], object]) -> float:
@@ -58,15 +60,10 @@ def best_ms(render: Callable[[], object]) -> float:
     return 1e3 * min(times_s)
 
 
-def _middle_pose(twin: Twin) -> np.ndarray:
-    poses = twin.source.open().T_world_camera
-    return poses[len(poses) // 2]
-
-
-def _rendered(twin: Twin) -> dict[str, Decision]:
+def _rendered(views: Views) -> dict[str, Decision]:
     """Decisions of the effects that no fit needs: the lens is seen at once, the others are rendered on
     request."""
-    lens, reason = effect_class("lens").evidence(twin.source.open())
+    lens, reason = Lens.told_by(views.camera, views.lens_mask)
     decisions = {
         name: Decision("off", f"rendered on request: synth --effects {name}=on") for name in RENDERED
     }

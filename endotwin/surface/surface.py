@@ -54,10 +54,16 @@ class Surface:
         )
 
     def to_local(self, T_world_camera: np.ndarray) -> np.ndarray:
-        """The pose [4, 4] with its translation relative to ``origin_mm``, float64."""
+        """Poses [..., 4, 4] with their translation relative to ``origin_mm``, float64."""
         T_local_camera = np.array(T_world_camera, np.float64)
-        T_local_camera[:3, 3] -= self.origin_mm
+        T_local_camera[..., :3, 3] -= self.origin_mm
         return T_local_camera
+
+    def to_world(self, T_local_camera: np.ndarray) -> np.ndarray:
+        """The inverse of ``to_local``, poses float64 [..., 4, 4]."""
+        T_world_camera = np.array(T_local_camera, np.float64)
+        T_world_camera[..., :3, 3] += self.origin_mm
+        return T_world_camera
 
     def normal_agreement(self) -> np.ndarray:
         """Least cosine between two corners' normals of each triangle, float32 [F]: 1 where it is flat."""

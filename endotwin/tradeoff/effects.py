@@ -122,7 +122,9 @@ def _measure(
     if rendered_too:
         for name, milliseconds in rendered_ms(twin).items():
             found[name]["render_ms"] = milliseconds
-    keep({**asked, **measurement, "effects": found, "frame_ms": frame_ms(Renderer(twin))}, result)
+    poses = twin.sequence().T_world_camera
+    pose = poses[len(poses) // 2]
+    keep({**asked, **measurement, "effects": found, "frame_ms": frame_ms(Renderer(twin), pose)}, result)
 
 
 def rendered_ms(twin: Twin) -> dict[str, float]:

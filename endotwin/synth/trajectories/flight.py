@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from endotwin.cameras import Camera
 from endotwin.errors import TrajectoryError
+from endotwin.run.streams import Stream
 from endotwin.surface.vectors import unit
 from endotwin.synth.trajectories.centerline import Centerline, arc_length, find_centerline, longest_run
 from endotwin.synth.trajectories.lumen import Lumen
@@ -134,7 +135,7 @@ def stops(frames: int, speed: float, length_mm: float) -> np.ndarray:
 
 def _sway(at_mm: np.ndarray, look_degrees: float, seed: int) -> np.ndarray:
     """Rotations [N, 3, 3] in the camera frame that sway the view by up to ``look_degrees`` along the path."""
-    phase = 2 * np.pi * np.random.default_rng(seed).random(2)
+    phase = 2 * np.pi * Stream.SWAY.generator(seed).random(2)
     swing = np.sin(2 * np.pi * at_mm[:, None] / np.array(SWAY_MM) + phase) / np.sqrt(2)
     turn = np.zeros((len(at_mm), 3))
     turn[:, 1], turn[:, 0] = swing.T

@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from endotwin.cameras import Camera
 from endotwin.errors import TrajectoryError
+from endotwin.run.streams import Stream
 from endotwin.sequence.poses import frame_times, read_poses
 from endotwin.synth.trajectories.flight import FlightOptions, fly
 from endotwin.synth.trajectories.keyframes import SplineOptions, spline_through
@@ -206,7 +207,7 @@ def _jittered(spec: str, options: JitterOptions, twin: Twin, gate: Gate, seed: i
         )
     frames = options.frames or len(recorded)
     bases = usable[np.arange(frames) * len(usable) // frames]
-    generators = [np.random.default_rng([seed, index]) for index in range(frames)]
+    generators = [Stream.JITTER.generator(seed, index) for index in range(frames)]
     poses = np.stack([_moved(*each) for each in zip(bases, [options] * frames, generators, strict=True)])
     pending, redrawn = np.flatnonzero(~gate.judge(poses).passes), 0
     for _ in range(REDRAWS):

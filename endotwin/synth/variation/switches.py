@@ -9,6 +9,7 @@ import numpy as np
 
 from endotwin.effects import FITTED, NAMES, RENDERED, Effects, effect_class
 from endotwin.effects.offset import Offset
+from endotwin.effects.shadows import Shadows
 from endotwin.errors import OptionError
 from endotwin.light.guides import AT_LENS
 from endotwin.synth.variation.edits import OFFSETS, Edit
@@ -36,8 +37,14 @@ def equipped(twin: Twin, states: Mapping[str, str], trajectory: str) -> Twin:
     """The twin with effects on or off as ``states`` say, as strong as its sequence shows them to be.
 
     Raises:
-        OptionError: an effect that only a fit can turn on, or blur of a trajectory without a velocity.
+        OptionError: an effect that only a fit can turn on or decide, or blur of a trajectory without a
+            velocity.
     """
+    undecided = [name for name, state in states.items() if state == "auto"]
+    if undecided:
+        raise OptionError(
+            f"{undecided[0]}=auto is for 'endotwin fit', which decides; write {undecided[0]}=on or off here"
+        )
     effects = twin.effects.without([name for name, state in states.items() if state == "off"])
     for name, state in states.items():
         if state != "on" or name in effects:
@@ -69,7 +76,10 @@ def edit_effects(effects: Effects, edits: Iterable[Edit]) -> Effects:
 
 
 def edit_offset(effects: Effects, edits: Iterable[Edit]) -> Effects:
-    """The effects after edits ``offset.x``, ``.y`` or ``.z`` (mm) of every light guide's place."""
+    """The effects after edits ``offset.x``, ``.y`` or ``.z`` (mm) of every light guide's place.
+
+    Light that was at the lens casts shadows once it is beside it.
+    """
     moves = [edit for edit in edits if edit.name in OFFSETS]
     if not moves:
         return effects
@@ -77,4 +87,6 @@ def edit_offset(effects: Effects, edits: Iterable[Edit]) -> Effects:
     for edit in moves:
         axis = OFFSETS.index(edit.name)
         guides_mm[:, axis] = edit.apply(guides_mm[:, axis])
+    if "offset" not in effects:
+        effects = effects.including(Shadows())
     return effects.including(Offset(tuple(tuple(map(float, guide)) for guide in guides_mm)))

@@ -12,6 +12,7 @@ import yaml
 
 from endotwin.effects import NAMES as EFFECTS
 from endotwin.errors import OptionError
+from endotwin.run.streams import Stream
 from endotwin.synth.variation.edits import (
     LIGHTS,
     MATERIALS,
@@ -87,7 +88,7 @@ class Draw:
         materials = edit_materials(twin.materials, self.material)
         for region, edits in zip(regions, self.regions, strict=True):
             materials = edit_materials(materials, edits, region.weight)
-        effects = edit_offset(switched(twin.effects, self.effects), self.light)
+        effects = switched(edit_offset(twin.effects, self.light), self.effects)
         twin = replace(
             twin,
             materials=materials,
@@ -132,7 +133,7 @@ class Variation:
 
     def draw(self, frames: int, seed: int) -> tuple[Draw, ...]:
         """One draw a frame, the same for the same seed whatever is rendered."""
-        clips = [self._draw(np.random.default_rng([seed, 1, k])) for k in range(-(-frames // self.clip))]
+        clips = [self._draw(Stream.VARIATION.generator(seed, k)) for k in range(-(-frames // self.clip))]
         return tuple(clips[index // self.clip] for index in range(frames))
 
     def _draw(self, generator: np.random.Generator) -> Draw:
