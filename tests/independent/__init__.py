@@ -4,6 +4,7 @@ truth.
     wall      a closed surface given as a grid, and rays to it
     colon     the shape of a random lumen           mucosa     its albedo and roughness
     path      where the camera goes                 lens       which ray each pixel sees along
+    gloss     reflected surroundings
     light     lamps, diffuse and glossy reflection  radiosity  light that tissue throws on tissue
     scene     everything drawn from a seed          picture    radiance of frames, and photos
     shown     what each effect changes in the photos, after the best fit of the rest

@@ -65,7 +65,7 @@ def ggx(
     1) + 1)²), G = Π 2/(1 + √(1 + α² tan²θ)), F = f0 + (1 − f0)(1 − cosθ_d)⁵."""
     half = unit(to_light + to_eye)
     cos_light, cos_eye = dot(normals, to_light), np.maximum(dot(normals, to_eye), 1e-4)
-    alpha2 = np.asarray(roughness, np.float64) ** 4
+    alpha2 = roughness**4
     across = np.cross(normals, half)
     sin2 = dot(across, across)
     density = alpha2 / (np.pi * (sin2 + alpha2 * (1 - sin2)) ** 2)

@@ -1,11 +1,12 @@
 """Diffuse light between all parts of a wall, to the end of its bounces.
 
 Patches are blocks of the grid. E = K·ρ·(E_direct + E) with K the share of a patch's cosine-weighted rays that
-end on each other patch (Goral et al. 1984); albedo is a patch's mean. Mirror-like reflection carries no light
-from tissue to tissue here.
+end on each other patch (Goral et al. 1984). From patch to patch all reflection is diffuse.
 """
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import numpy as np
 import scipy.sparse
@@ -25,15 +26,32 @@ CONVERGED = 1e-4
 MOST_BOUNCES = 200
 
 
+@dataclass(frozen=True)
+class Bounce:
+    """Indirect irradiance and radiosity of patches in F frames, float32 [F, R, C, 3]."""
+
+    arriving: np.ndarray
+    leaving: np.ndarray
+
+    def at(self, frame: int, place: np.ndarray, mirrored: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Indirect irradiance at places [N, 2] of the wall, and radiosity at places [N, 2] that they mirror;
+        interpolated between patches' centres."""
+        return (
+            sampled(self.arriving[frame], place / BLOCK - 0.5),
+            sampled(self.leaving[frame], mirrored / BLOCK - 0.5),
+        )
+
+
 class Radiosity:
-    """Patches of a wall, [R, C] of them, with ``albedo`` [H, W, 3] as a map over the wall.
+    """Patches of a wall, [R, C] of them, with the map ``tissue`` [H, W, K] over it.
 
     Attributes:
+        shape: R, C. tissue: float32 [P, K], means over the patches.
         patch_of: int [T], patch of each triangle. form_factors: CSR [P, P]; a row sums to 1 where the wall is
-        closed. albedo: float32 [P, 3].
+        closed.
     """
 
-    def __init__(self, wall: Wall, albedo: np.ndarray, rng: np.random.Generator):
+    def __init__(self, wall: Wall, tissue: np.ndarray, rng: np.random.Generator):
         self._wall = wall
         self.shape = ((wall.shape[0] - 1) // BLOCK, wall.shape[1] // BLOCK)
         corners = wall.vertices_mm[wall.triangles]
@@ -47,9 +65,9 @@ class Radiosity:
         self.patch_of[self._triangles] = np.arange(len(self._triangles))[:, None]
         self.form_factors = self._counted(corners, rng)
         rows, columns = np.divmod(np.arange(len(area)) // 2, wall.shape[1])
-        scale = (albedo.shape[0] - 1) / (wall.shape[0] - 1)
-        texels = sampled(albedo, scale * np.stack([rows + 0.5, columns + 0.5], axis=1))
-        self.albedo = self._mean(texels).astype(np.float32)
+        scale = (tissue.shape[0] - 1) / (wall.shape[0] - 1)
+        texels = sampled(tissue, scale * np.stack([rows + 0.5, columns + 0.5], axis=1))
+        self.tissue = self._mean(texels).astype(np.float32)
 
     def direct(self, lamp: Lamp, pose: np.ndarray) -> np.ndarray:
         """Irradiance float32 [P] that the lamp of a camera at ``pose`` [4, 4] throws on the patches."""
@@ -66,25 +84,18 @@ class Radiosity:
             total[lit] += strength[lit]
         return self._mean(total[:, None])[:, 0].astype(np.float32)
 
-    def indirect(self, direct: np.ndarray) -> np.ndarray:
-        """Indirect irradiance float32 [P, F, 3] for direct irradiance [P, F], all bounces."""
-        albedo = self.albedo[:, None]
+    def bounce(self, direct: np.ndarray, albedo: np.ndarray) -> Bounce:
+        """All light between patches [P] of ``albedo`` [P, 3] for direct irradiance [P, F]."""
+        albedo = albedo[:, None].astype(np.float32)
         source = albedo * direct[..., None]
         arriving = np.zeros_like(source)
         for _ in range(MOST_BOUNCES):
-            leaving = (source + albedo * arriving).reshape(len(direct), -1)
-            before, arriving = arriving, (self.form_factors @ leaving).reshape(source.shape)
+            leaving = source + albedo * arriving
+            before = arriving
+            arriving = (self.form_factors @ leaving.reshape(len(direct), -1)).reshape(source.shape)
             if np.abs(arriving - before).max() <= CONVERGED * arriving.max():
                 break
-        return arriving
-
-    def as_map(self, per_patch: np.ndarray) -> np.ndarray:
-        """Values [P, C] as an image [R, C, …] for ``at``."""
-        return per_patch.reshape(*self.shape, -1)
-
-    def at(self, image: np.ndarray, place: np.ndarray) -> np.ndarray:
-        """Values of ``as_map`` at places [N, 2] of the wall, interpolated between patches' centres."""
-        return sampled(image, place / BLOCK - 0.5)
+        return Bounce(*(np.moveaxis(x, 1, 0).reshape(-1, *self.shape, 3) for x in (arriving, leaving)))
 
     def _of_blocks(self) -> np.ndarray:
         """Triangles int [P, 2·BLOCK²] of each patch."""

@@ -82,10 +82,13 @@ class Scene:
             frames=int(rng.integers(8, 25)),
         )
 
+    def having(self, effects: frozenset[str]) -> Scene:
+        """The same scene with these effects and no others."""
+        return replace(self, effects=effects)
+
     def without(self, name: str) -> Scene:
         """The same scene lacking one effect; without an offset there is no shadow."""
-        gone = {"offset", "shadows"} if name == "offset" else {name}
-        return replace(self, effects=self.effects - gone)
+        return self.having(self.effects - ({"offset", "shadows"} if name == "offset" else {name}))
 
     @property
     def lamp(self) -> Lamp:

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from independent.gloss import Gloss
 from independent.light import Lamp, burley, dot, ggx, lambert
 from independent.radiosity import Radiosity
 from independent.shapes import disc
@@ -82,3 +83,15 @@ def test_lobes_are_reciprocal() -> None:
         (ggx(normals, a, b, roughness, 0.04), ggx(normals, b, a, roughness, 0.04)),
     ):
         np.testing.assert_allclose((there / dot(normals, a))[kept], (back / dot(normals, b))[kept], rtol=1e-6)
+
+
+@pytest.mark.parametrize("roughness", [0.25, 0.5])
+@pytest.mark.parametrize("tilt", [0.2, 1.2])
+def test_the_table_of_gloss_is_the_lobes_integral(roughness: float, tilt: float) -> None:
+    """R = ∫ f·cosθ dω over all directions that light may come from."""
+    directions, solid = hemisphere(800)
+    to_eye = np.array([np.sin(tilt), 0, np.cos(tilt)])
+    normals, to_eye = (np.broadcast_to(v, directions.shape) for v in (UP, to_eye))
+    whole = (ggx(normals, directions, to_eye, roughness, 0.03) * solid).sum()
+    table = Gloss(0.03).at(np.array([np.cos(tilt)]), np.array([roughness]))[0]
+    assert table == pytest.approx(whole, rel=0.02)

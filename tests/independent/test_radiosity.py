@@ -14,7 +14,7 @@ def test_a_sphere_is_an_integrating_sphere(albedo: float) -> None:
     wall = sphere(12)
     radiosity = Radiosity(wall, np.full((*wall.shape, 3), albedo), np.random.default_rng(0))
     direct = radiosity.direct(Lamp(L0=700, n=1.5, q=2), np.eye(4))[:, None]
-    indirect = radiosity.indirect(direct)[:, 0, 0]
+    indirect = radiosity.bounce(direct, radiosity.tissue).arriving[..., 0]
     share = np.sqrt((wall.doubled_area**2).sum(axis=1))
     mean = (share * direct[radiosity.patch_of, 0]).sum() / share.sum()
     assert indirect.mean() == pytest.approx(albedo / (1 - albedo) * mean, rel=0.01)

@@ -15,6 +15,9 @@ from embreex.mesh_construction import TriangleMesh
 BIAS = 1e-3
 """A point is in shadow of what lies nearer than its distance less this share: facets shade themselves not."""
 
+LIFT_MM = 0.01
+"""Mirrored rays start so far above the wall."""
+
 
 @dataclass(frozen=True)
 class Hits:
@@ -22,7 +25,8 @@ class Hits:
 
     Attributes:
         rays: int [N], numbers of the rays that hit. points_mm, normals: [N, 3], normals interpolated between
-            vertices. place: [N, 2], row and column.
+            vertices. place: [N, 2], row and column. All
+            float32.
     """
 
     rays: np.ndarray
@@ -75,6 +79,16 @@ class Wall:
             rays, self._mixed(self.vertices_mm, triangle, weights), unit(normals), self._place(triangle, u, v)
         )
 
+    def mirrored(self, hits: Hits, directions: np.ndarray) -> np.ndarray:
+        """Places float32 [N, 2] that the hits of rays with ``directions`` would show if they were mirrors."""
+        ray = directions[hits.rays]
+        aside = (ray * hits.normals).sum(axis=1, keepdims=True)
+        turned = ray - 2 * aside * hits.normals
+        far = self.cast(hits.points_mm + LIFT_MM * hits.normals, turned)
+        place = hits.place.copy()
+        place[far.rays] = far.place
+        return place
+
     def hit_triangle(self, origins_mm: np.ndarray, directions: np.ndarray) -> np.ndarray:
         """First triangle int [N] that rays [N, 3] meet; −1: none."""
         origins, towards = (np.ascontiguousarray(x, np.float32) for x in (origins_mm, directions))
@@ -94,7 +108,9 @@ class Wall:
     def _place(self, triangle: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
         quad, second = np.divmod(triangle, 2)
         row, column = np.divmod(quad, self.shape[1])
-        return np.stack([row + np.where(second, 1 - u, u), column + np.where(second, 1 - v, v)], axis=1)
+        return np.stack(
+            [row + np.where(second, 1 - u, u), column + np.where(second, 1 - v, v)], axis=1
+        ).astype(np.float32)
 
 
 def unit(vectors: np.ndarray) -> np.ndarray:

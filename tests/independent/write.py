@@ -11,7 +11,7 @@ import numpy as np
 
 from independent.picture import Studio
 from independent.scene import Scene
-from independent.shown import shown_levels
+from independent.shown import shown_levels, wrong_levels
 
 DEPTH_RANGE_MM = 100.0
 MADE = Path("truth") / "made.json"
@@ -34,6 +34,6 @@ def make(scene: Scene, folder: Path) -> dict:
     rows = studio.poses.transpose(0, 2, 1).reshape(-1, 16)
     (folder / "pose.txt").write_text("".join(",".join(f"{x:.9g}" for x in row) + "\n" for row in rows))
     (folder / "camera.json").write_text(json.dumps(scene.lens.to_dict(), indent=1) + "\n")
-    made = studio.scene.to_dict() | {"shown": shown_levels(studio)}
+    made = studio.scene.to_dict() | {"shown": shown_levels(studio), "wrong_levels": wrong_levels(studio)}
     (folder / MADE).write_text(json.dumps(made, indent=1) + "\n")
     return made
