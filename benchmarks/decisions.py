@@ -10,7 +10,7 @@ and the evidence of the wrong decisions. ``--forced`` fits scenes with a wrong d
 true effects, which tells what it cost.
 
 The column (3 %) tells how well the photos know γ: levels of 255 that an error of 3 % shows, all else fitted
-as well as it can be. Where it is a small part of one, γ cannot be asked for.
+as well as it can be. The smaller, the more does a small fault of the model bend γ.
 
 Not counted is what no photo tells: an effect that changes the photos by less than 1/255 (root mean square)
 after the best fit of the rest (see ``independent.shown``); and vignetting and profile, which say the same of
@@ -84,13 +84,13 @@ class Row:
 
 def judged(seed: int, only: list[str], work: Path, forced: bool) -> Row:
     """Make the scene if need be, fit it and compare."""
-    folder = work / f"{seed:04d}" / ("all" if set(only) == set(EFFECTS) else "+".join(sorted(only)))
+    folder = work / f"{seed:04d}" / ("all" if set(only) == set(EFFECTS) else "+".join(sorted(only)) or "none")
     made = make(Scene.draw(seed, only), folder)
     true, levels = made["effects"], {name: shown["levels"] for name, shown in made["shown"].items()}
     fit = fitted(folder, made, None)
     skipped = uncounted(true, levels)
     wrong = [name for name in EFFECTS if name not in skipped and (name in fit.on) != (name in true)]
-    again = fitted(folder, made, {name: states(name, true) for name in EFFECTS}) if forced and wrong else None
+    again = fitted(folder, made, states(true, skipped)) if forced and wrong else None
     return Row(seed, true, levels, made["wrong_levels"], skipped, fit, again, wrong)
 
 
@@ -105,9 +105,9 @@ def uncounted(true: list[str], levels: dict[str, float]) -> list[str]:
     return sorted(faint)
 
 
-def states(name: str, true: list[str]) -> str:
-    """The true state of an effect, as a fit can be told."""
-    return "on" if name in true and (name != "vignetting" or "offset" in true) else "off"
+def states(true: list[str], skipped: list[str]) -> dict[str, str]:
+    """The true states of effects, as a fit can be told; it may decide those that cannot be told."""
+    return {name: "on" if name in true else "off" for name in EFFECTS if name not in skipped}
 
 
 def fitted(folder: Path, made: dict, effects: dict[str, str] | None) -> Fit:
@@ -240,8 +240,8 @@ def write_csv(path: Path, rows: list[Row]) -> None:
 
 
 def effects(text: str) -> list[str]:
-    """Names of effects, separated by commas."""
-    names = text.split(",")
+    """Names of effects, separated by commas, or none."""
+    names = [] if text == "none" else text.split(",")
     if unknown := set(names) - set(EFFECTS):
         raise argparse.ArgumentTypeError(f"{sorted(unknown)[0]!r} is none of {', '.join(EFFECTS)}")
     return names

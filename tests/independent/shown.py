@@ -8,7 +8,7 @@ show beside the other. What remains is what the effect shows, as root mean squar
 stays as it is while guides and profile change.
 
 In the same way, what a wrong γ, n or q shows is what is left of its change after the best fit of all else:
-where that is a fraction of a level, no fit can be asked for it.
+the smaller, the more does a small fault of a model bend it.
 """
 
 from __future__ import annotations
