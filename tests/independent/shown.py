@@ -105,7 +105,8 @@ class Pixels:
         return np.concatenate([view.points_mm for view in self._views]).astype(np.float64)
 
     @cached_property
-    def _cell(self) -> np.ndarray:
+    def cell(self) -> np.ndarray:
+        """Number of the cell of the wall that each pixel [N] sees."""
         row, column = np.floor(np.concatenate([view.place for view in self._views]) / CELL).astype(np.int64).T
         return np.unique(row * 65536 + column, return_inverse=True)[1].reshape(-1)
 
@@ -127,9 +128,9 @@ class Pixels:
         albedo nor ``columns`` [N] of the logarithm of radiance take up."""
         slope = self.unclipped(value)
         weighted = np.stack([change, *(slope * values for values in columns)], axis=1)
-        weight = np.maximum(np.bincount(self._cell, slope**2), 1e-12)
+        weight = np.maximum(np.bincount(self.cell, slope**2), 1e-12)
         for k, values in enumerate(weighted.T):
-            weighted[:, k] = values - slope * (np.bincount(self._cell, slope * values) / weight)[self._cell]
+            weighted[:, k] = values - slope * (np.bincount(self.cell, slope * values) / weight)[self.cell]
         solution = np.linalg.lstsq(weighted[:, 1:], weighted[:, 0], rcond=None)[0]
         return 255 * float(np.sqrt(np.mean((weighted[:, 0] - weighted[:, 1:] @ solution) ** 2)))
 
