@@ -71,7 +71,7 @@ class Scene:
             guides_mm=_guides(rng),
             vignetting=float(rng.uniform(0.15, 0.5)),
             gain=float(rng.uniform(1.3, 2.5)),
-            coat_weight=float(rng.uniform(0.7, 2)),
+            coat_weight=float(rng.uniform(0.5, 1)),
             coat_roughness=float(np.exp(rng.uniform(np.log(0.06), np.log(0.25)))),
             diffuse=str(rng.choice(["burley", "lambert"], p=[0.7, 0.3])),
             roughness=float(rng.uniform(0.35, 0.6)),

@@ -48,7 +48,10 @@ def test_depth_maps_of_two_frames_show_one_wall(tmp_path) -> None:
 def test_a_scene_is_made_once_and_its_seed_tells_all_of_it(tmp_path) -> None:
     scene = replace(Scene.draw(0), lens=SMALL, frames=2).having(frozenset({"gain", "coat"}))
     made = make(scene, tmp_path / "a")
-    assert make(replace(scene, gamma=0.1), tmp_path / "a") == made
+    written = (tmp_path / "a" / MADE).stat().st_mtime_ns
+    assert make(scene, tmp_path / "a") == made
+    assert (tmp_path / "a" / MADE).stat().st_mtime_ns == written
+    make(replace(scene, gamma=0.4), tmp_path / "b")
     make(scene, tmp_path / "b")
     files = [path.relative_to(tmp_path / "a") for path in (tmp_path / "a").rglob("*.*")]
     assert MADE in files

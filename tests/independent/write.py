@@ -18,10 +18,10 @@ MADE = Path("truth") / "made.json"
 
 
 def make(scene: Scene, folder: Path) -> dict:
-    """Render the scene into ``folder`` and return the content of its ``truth/made.json``; what is there
-    already stays."""
-    if (folder / MADE).exists():
-        return json.loads((folder / MADE).read_text())
+    """Render the scene into ``folder``, unless it is there already, and return the content of its
+    ``truth/made.json``."""
+    if (folder / MADE).exists() and _is_of(scene, made := json.loads((folder / MADE).read_text())):
+        return made
     shutil.rmtree(folder, ignore_errors=True)
     (folder / "truth").mkdir(parents=True)
     studio = Studio(scene)
@@ -37,3 +37,9 @@ def make(scene: Scene, folder: Path) -> dict:
     made = studio.scene.to_dict() | {"shown": shown_levels(studio), "wrong_levels": wrong_levels(studio)}
     (folder / MADE).write_text(json.dumps(made, indent=1) + "\n")
     return made
+
+
+def _is_of(scene: Scene, made: dict) -> bool:
+    """Whether ``made.json`` tells of this scene: all that is drawn is the same."""
+    drawn = json.loads(json.dumps(scene.to_dict()))
+    return all(made.get(name) == value for name, value in drawn.items() if name != "L0")
