@@ -219,8 +219,8 @@ def run(options: argparse.Namespace, work: Path) -> list[Row]:
         for seed in options.seeds:
             try:
                 row = pool.submit(judged, seed, options.only, work, options.forced).result()
-            except endotwin.EndotwinError as error:
-                print(f"{seed:4d}  failed: {error}", flush=True)
+            except Exception as error:  # a fit that breaks is a finding too
+                print(f"{seed:4d}  failed: {type(error).__name__}: {error}", flush=True)
                 continue
             rows.append(row)
             print(line(row), flush=True)
@@ -259,6 +259,8 @@ def main() -> None:
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as temporary:
         rows = run(options, options.work or Path(temporary))
+    if failed := len(options.seeds) - len(rows):
+        print(f"\n{failed} scenes failed and are left out of what follows")
     print(f"\n{confusion(rows)}\n\n{evidence(rows)}")
 
 
