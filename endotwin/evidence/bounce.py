@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import torch
 
@@ -17,9 +19,8 @@ CELL = 0.15
 PROBE_CELLS, PROBE_RAYS = 2.0, 64
 """The probe's patches are so many times larger, and each sends so many rays."""
 
-PROBE_ALBEDO = 0.8
-"""98th percentile of the brightest channel that the probe assumes: any tissue's is near enough to tell
-whether light bounces at all."""
+PROBE_ALBEDOS = (0.55, 0.7, 0.85)
+"""98th percentiles of the brightest channel that the probe tries: they tell how strong the bounce is."""
 
 FIXED_POINT_ROUNDS = 2
 
@@ -54,25 +55,31 @@ def bounced(probe: Probe, hypothesis: Hypothesis) -> Bounced:
         color = places.weights @ base_color
         return (irradiance * (color + gloss.numpy()[:, None])).sum(axis=1) / color.sum(axis=1)
 
-    light_there = direct_light
-    for _ in range(FIXED_POINT_ROUNDS):
-        base_color, L0 = _patch_albedo(linear, light_there, patch, radiosity.count)
-        albedo = Albedo(base_color, glossy)
-        light_there = direct_light + seen(light.at(places, n, q, albedo.scaled(0.0)), base_color)
-    found = light.expanded(places, n, q, albedo, gloss)
-    log = np.log(np.maximum(seen(found.irradiance(n, q).numpy(), base_color), 1e-30))
-    return Bounced(log, found.by_n.numpy(), found.by_q.numpy(), L0)
+    def under(brightest: float) -> Bounced:
+        light_there = direct_light
+        for _ in range(FIXED_POINT_ROUNDS):
+            base_color, L0 = _patch_albedo(linear, light_there, patch, radiosity.count, brightest)
+            albedo = Albedo(base_color, glossy)
+            light_there = direct_light + seen(light.at(places, n, q, albedo.scaled(0.0)), base_color)
+        found = light.expanded(places, n, q, albedo, gloss)
+        log = np.log(np.maximum(seen(found.irradiance(n, q).numpy(), base_color), 1e-30))
+        return Bounced(log, found.by_n.numpy(), found.by_q.numpy(), L0)
+
+    tried = [under(brightest) for brightest in PROBE_ALBEDOS]
+    models = [probe.fit(replace(hypothesis, bounced=each)) for each in tried]
+    gains_db = [probe.compare(models[0], model).gain_db for model in models]
+    return tried[int(np.argmax(gains_db))]
 
 
 def _patch_albedo(
-    linear: np.ndarray, light: np.ndarray, patch: np.ndarray, count: int
+    linear: np.ndarray, light: np.ndarray, patch: np.ndarray, count: int, brightest: float
 ) -> tuple[np.ndarray, float]:
     """Least-squares albedo [P, 3] of patches from linear photo values [N, 3] under ``light`` [N] for L0 =
-    1, with PROBE_ALBEDO as its scale (the median where no pixel is); and the L0 that this scale asks for."""
+    1, with ``brightest`` as its scale (the median where no pixel is); and the L0 that this scale asks for."""
     weight = np.bincount(patch, light * light, count)
     sums = np.stack([np.bincount(patch, light * channel, count) for channel in linear.T], axis=1)
     seen = weight > 0
     albedo = np.where(seen[:, None], sums / np.where(seen, weight, 1)[:, None], 0)
     albedo[~seen] = np.median(albedo[seen], axis=0)
-    scale = PROBE_ALBEDO / float(np.percentile(albedo[seen].max(axis=1), 98))
+    scale = brightest / float(np.percentile(albedo[seen].max(axis=1), 98))
     return albedo * scale, 1 / (2 * scale)

@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
-from scipy.linalg import block_diag
 
 from endotwin.effects.vignetting import squared_radius
 from endotwin.light.guides import AT_LENS, COSINE, guided, log_axis, visible_from
@@ -36,13 +35,15 @@ DARKEST = -20.0
 """Logarithm of light that counts as none."""
 
 MIN_GAIN_DB = 0.2
-MIN_SIGMAS = 4.0
-"""An effect is kept where it lowers the held-out error by so much, and by so many of its own
-uncertainties. Of the scenes that were tried, those without an effect show at most 0.19 dB of it, 0.04 dB
-where no light is bounced; those that have it at least 0.57 dB."""
+MIN_SIGMAS = 3.0
+"""An effect is kept where it lowers the held-out error by so much, and by so many of its uncertainties."""
 
-VIGNETTING_SPREAD = 0.3
-"""Prior standard deviation of γ·k2 and γ·k4 about 0. Like that of γn, γq and γ it counts against one
+MIN_IMPOSSIBLE_DB = 3.0
+"""What it takes if γ, n or q are then such as no endoscope has: the model of light may lack something, and
+the effect be there all the same."""
+
+VIGNETTING_SPREAD = 0.1
+"""Prior standard deviation of γ·k2 about 0. Like that of γn, γq and γ it counts against one
 observation a vertex: what the model lacks errs alike in all pixels of one."""
 
 POSSIBLE = ((0.1, 2.0), (-1.0, 12.0), (-0.5, 7.0))
@@ -67,6 +68,9 @@ class Bounced:
     by_q: np.ndarray
     L0: float
 
+    def __getitem__(self, rows: np.ndarray) -> Bounced:
+        return Bounced(self.log[rows], self.by_n[rows], self.by_q[rows], self.L0)
+
     def at(self, n: float, q: float) -> np.ndarray:
         """ln of the irradiance [N] under another n and q, to first order about their priors."""
         return self.log + (n - PRIOR["n"]) * self.by_n + (q - PRIOR["q"]) * self.by_q
@@ -87,7 +91,7 @@ class Hypothesis:
 @dataclass(frozen=True)
 class Verdict:
     """By how much one hypothesis predicts unseen pixels better than another: dB, and in its own sigmas; and
-    whether light and response of the better one are any endoscope's."""
+    whether light and response of the better one are any endoscope's, or the other's neither."""
 
     gain_db: float
     sigmas: float
@@ -95,11 +99,16 @@ class Verdict:
 
     @property
     def keep(self) -> bool:
-        return self.possible and self.gain_db >= MIN_GAIN_DB and self.sigmas >= MIN_SIGMAS
+        return self.worth(Verdict(MIN_GAIN_DB, MIN_SIGMAS))
 
     @property
     def hints(self) -> bool:
         return self.gain_db >= HINT_DB and self.sigmas >= HINT_SIGMAS
+
+    def worth(self, least: Verdict) -> bool:
+        """Whether both its numbers are at least those of ``least``, and what is possible or else plain."""
+        least_db = least.gain_db if self.possible else MIN_IMPOSSIBLE_DB
+        return self.gain_db >= least_db and self.sigmas >= least.sigmas
 
     def __str__(self) -> str:
         impossible = "" if self.possible else ", but with a light that no endoscope has"
@@ -153,7 +162,8 @@ class Probe:
         corner = samples.barycentric.argmax(dim=1).numpy()[rows]
         vertex = surface.triangles[samples.triangle.numpy()[rows], corner]
         chosen = _whole_groups(vertex, len(surface.vertices_mm), pixels, generator)
-        self.samples = samples[torch.from_numpy(rows[chosen])]
+        self._rows = rows[chosen]
+        self.samples = samples[torch.from_numpy(self._rows)]
         self.vertex = np.unique(vertex[chosen], return_inverse=True)[1].reshape(-1)
         self.count = int(self.vertex.max(initial=-1)) + 1
         self._half = (generator.random(self.count) < 0.5)[self.vertex]
@@ -161,6 +171,11 @@ class Probe:
 
     def __len__(self) -> int:
         return len(self.target)
+
+    def part(self, pixels: int) -> tuple[Probe, np.ndarray]:
+        """A probe of about so many of these pixels, all of some vertices; and which, int [M]."""
+        part = Probe(self.samples, self.twin, self.caster, pixels)
+        return part, part._rows
 
     @cached_property
     def frames(self) -> np.ndarray:
@@ -228,13 +243,6 @@ class Probe:
                 n, q = found.n, found.q
         return found
 
-    def with_columns(self, base: Fitted, columns: np.ndarray) -> Fitted:
-        """``base`` with free ``columns`` [N, K] beside its own: what an effect would do to first order."""
-        precision, pull = base.design.prior
-        prior = block_diag(precision, np.zeros((columns.shape[1],) * 2)), np.r_[pull, np.zeros(columns.shape[1])]
-        design = replace(base.design, columns=np.c_[base.design.columns, columns], prior=prior)
-        return self._fitted(base.hypothesis, design)
-
     def loss(self, hypothesis: Hypothesis, base: Fitted, visible: np.ndarray | None = None) -> float:
         """Robust loss of all pixels, linearised about ``base``, under guides that see them as ``visible`` [N,
         K] says (found out unless given)."""
@@ -246,7 +254,7 @@ class Probe:
         """How much better ``other`` predicts pixels of vertices that did not choose its coefficients."""
         designs = base.design, other.design
         verdict = compared(self.target, *designs, self._half, base.effects.width, len(self.frames))
-        return replace(verdict, possible=other.possible)
+        return replace(verdict, possible=other.possible or not base.possible)
 
     def _fitted(self, hypothesis: Hypothesis, design: Design) -> Fitted:
         return Fitted(hypothesis, design, regress(self.target, design, len(self.frames)))
@@ -254,13 +262,11 @@ class Probe:
     def _design(self, hypothesis: Hypothesis, columns: np.ndarray) -> Design:
         mean, spread = list(LIGHT_MEAN), list(LIGHT_SPREAD)
         if hypothesis.vignetting:
-            columns = np.c_[columns, self.vignetting_columns]
-            mean, spread = [*mean, 0.0, 0.0], [*spread, VIGNETTING_SPREAD, VIGNETTING_SPREAD]
+            columns = np.c_[columns, self.vignetting_column]
+            mean, spread = [*mean, 0.0], [*spread, VIGNETTING_SPREAD]
         precision = len(self) / max(self.count, 1) / np.square(spread)
         prior = np.diag(precision), precision * mean
-        return Design(
-            columns, self.vertex, self.count, self.frame if hypothesis.gain else None, prior=prior
-        )
+        return Design(columns, self.vertex, self.count, self.frame if hypothesis.gain else None, prior=prior)
 
     def _interpolated(self, per_vertex: np.ndarray) -> np.ndarray:
         corners = per_vertex[self.twin.surface.triangles[self.samples.triangle.numpy()]]
@@ -282,10 +288,10 @@ class Probe:
         return LogLight(log_cos, axis, log_distance, hypothesis.bounced)
 
     @cached_property
-    def vignetting_columns(self) -> np.ndarray:
-        """r² and r⁴ of each pixel, r = 1 at the middle of the image's longer side, [N, 2]."""
-        r2 = squared_radius(self.twin.camera, self.samples.pixel.numpy())
-        return np.c_[r2, r2 * r2]
+    def vignetting_column(self) -> np.ndarray:
+        """r² of each pixel, r = 1 at the middle of the image's longer side, [N]. No r⁴ beside it: light of
+        another exponent n is darker towards the rim in nearly the same way, and would lose its n to both."""
+        return squared_radius(self.twin.camera, self.samples.pixel.numpy())
 
 
 def compared(

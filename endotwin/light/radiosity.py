@@ -6,8 +6,9 @@ the form factors K (Goral et al. 1984; Monte Carlo estimate, Cohen & Wallace 199
 irradiance E under any light is E = K·ρ(E_direct + E), a few sparse products a bounce.
 
 A lumen is closed, and a mesh of what depth maps showed is not: from half of a wall's directions comes light
-of tissue that nobody saw. It is taken to be like the tissue that is seen from there, in less light: UNSEEN_DIRECT
-of the direct irradiance (a light that lies where the camera does hardly reaches it) and UNSEEN_INDIRECT of the indirect one.
+of tissue that nobody saw. It is taken to be like the tissue that is seen from there, in less light:
+UNSEEN_DIRECT of the direct irradiance (a light beside the camera hardly reaches what the camera does not see)
+and UNSEEN_INDIRECT of the indirect one.
 """
 
 from __future__ import annotations
@@ -43,8 +44,9 @@ LIFT = 1e-3
 """Rays start this share of a patch's size above it."""
 
 UNSEEN_DIRECT, UNSEEN_INDIRECT = 0.1, 0.8
-"""Against whole path-traced colons these bring the bounce from a mesh of what was seen from 36 % (red) and 65 % (green)
-of its strength to within 6 %, and halve its error from place to place; a convex hull about the mesh does worse."""
+"""Against whole colons these bring the bounce from a mesh of what was seen from 36 % (red) and 65 % (green)
+of its strength to within 6 %, and halve its error from place to place; a convex hull about the mesh does
+worse."""
 
 LEAST_SEEN = 0.1
 """Share of its directions that a patch must see something in for that to stand for the rest."""

@@ -184,7 +184,7 @@ def dark_surround(brightest: np.ndarray) -> np.ndarray:
 
 
 def _with_ringing(surround: np.ndarray, brightest: np.ndarray) -> np.ndarray:
-    """``surround`` bool [H, W] grown over what is dim, beside the image's lit part, within RINGING_PX of it."""
+    """``surround`` bool [H, W] grown over what is dim beside the image's lit part, within RINGING_PX."""
     dim = brightest <= max(SURROUND_LEVEL, RINGING_SHARE * np.median(brightest[~surround]))
     distance_px = cv2.distanceTransform((~surround).astype(np.uint8), cv2.DIST_L2, 5)
     near = surround | (dim & (distance_px <= RINGING_PX))
