@@ -26,8 +26,8 @@ from endotwin.effects.shadows import Shadows
 from endotwin.effects.specular import Specular
 from endotwin.effects.vignetting import Vignetting
 from endotwin.evidence.bounce import bounced, cell_mm
-from endotwin.evidence.guide_search import Search, found_guides
-from endotwin.evidence.probe import MIN_IMPOSSIBLE_DB, Fitted, Hypothesis, Probe, Verdict
+from endotwin.evidence.guide_search import Guides, Search, found_guides
+from endotwin.evidence.probe import MIN_IMPOSSIBLE_DB, Bounced, Fitted, Hypothesis, Probe, Verdict
 from endotwin.light.guides import AT_LENS, COSINE, EXPONENTIAL
 from endotwin.pixels.samples import Samples
 from endotwin.pixels.start import PRIOR
@@ -85,7 +85,7 @@ class _Trial:
         self._probe, self._wanted = probe, wanted
         self._decisions: dict[str, Decision] = {}
         self._seconds = dict.fromkeys((*TOGETHER, *BESIDE), 0.0)
-        self._model = cache(self._fitted)
+        self._model, self._bouncing = cache(self._fitted), cache(self._bounced)
         self._guides_mm = AT_LENS
 
     def wanted(self, name: str) -> str:
@@ -165,16 +165,15 @@ class _Trial:
         if "offset" in names:
             hypothesis = replace(hypothesis, guides_mm=self._guides_mm, shadows=True)
         if "interreflection" in names:
-            hypothesis = replace(hypothesis, bounced=self._bounced(hypothesis.guides_mm, "gain" in names))
+            hypothesis = replace(hypothesis, bounced=self._bouncing(hypothesis.guides_mm))
         found = self._probe.fit(hypothesis)
         for name in names:
             self._seconds[name] += (time.perf_counter() - began) / len(names)
         return found
 
-    @cache  # noqa: B019 (a trial lives as long as its decision)
-    def _bounced(self, guides_mm: tuple, gain: bool):
-        hypothesis = Hypothesis(guides_mm=guides_mm, shadows=guides_mm != AT_LENS, gain=gain)
-        return bounced(self._probe, hypothesis)
+    def _bounced(self, guides_mm: Guides) -> Bounced:
+        hypothesis = Hypothesis(guides_mm=guides_mm, shadows=guides_mm != AT_LENS)
+        return bounced(self._probe, replace(hypothesis, gain=self.wanted("gain") != "off"))
 
     def _best(self, sets: list[frozenset[str]]) -> frozenset[str]:
         """The set that predicts held-out pixels best; what no endoscope has counts MIN_IMPOSSIBLE_DB less."""
