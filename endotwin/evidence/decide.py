@@ -192,12 +192,11 @@ class _Trial:
         hypothesis = self._kept.hypothesis
         probe, base, best = self._probe, self._vignetted(hypothesis), None
         search = Search(Probe(probe.samples, probe.twin, probe.caster, SEARCH_PIXELS), base)
+        found = None
         for number in range(1, MOST_GUIDES + 1):
-            found = probe.fit(search.best(number, best))
-            if (best is None and forced and number == 2) or probe.compare(best or base, found).keep:
+            found = probe.fit(search.best(found and found.hypothesis))
+            if (best is None and forced and number == MOST_GUIDES) or probe.compare(best or base, found).keep:
                 best = found
-            elif number > 1:
-                break
         if best is None:
             self._decide("offset", "off", "no position of one to three guides predicts better", None)
             return

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from itertools import combinations
 
 import numpy as np
 from scipy.optimize import minimize
@@ -45,20 +44,15 @@ class Search:
     def __init__(self, probe: Probe, base: Fitted):
         self._probe, self._base = probe, base
         self._candidates = np.concatenate([ring_mm(probe, share) for share in RING_RADII])
-        self._visible = [probe.visible(guide) for guide in self._candidates]
-        self._at_risk = np.flatnonzero(~np.logical_and.reduce(self._visible))
+        seen = [probe.visible(guide) for guide in self._candidates]
+        self._at_risk = np.flatnonzero(~np.logical_and.reduce(seen))
         self._radius_mm = float(np.abs(self._candidates).max())
 
-    def best(self, number: int, fewer: Fitted | None) -> Hypothesis:
-        """The best hypothesis with ``number`` guides; ``fewer`` is the one with one less, if any was good."""
-        if fewer is None:
-            start = min(combinations(range(len(self._candidates)), number), key=self._candidate_loss)
-            start_mm = self._candidates[list(start)]
-        else:
-            known = np.asarray(fewer.hypothesis.guides_mm, np.float32)
-            joined = [np.vstack([known, candidate]) for candidate in self._candidates]
-            start_mm = min(joined, key=self._loss)
-        return self._refined(start_mm, REFINE_STEPS, SPREAD)
+    def best(self, fewer: Hypothesis | None) -> Hypothesis:
+        """The best hypothesis with one guide more than ``fewer``, which None is the light at the lens."""
+        known = np.empty((0, 3), np.float32) if fewer is None else np.asarray(fewer.guides_mm, np.float32)
+        joined = [np.vstack([known, candidate]) for candidate in self._candidates]
+        return self._refined(min(joined, key=self._loss), REFINE_STEPS, SPREAD)
 
     def polished(self) -> Hypothesis:
         """The base with its own guides moved to where they predict best beside all that was kept since."""
@@ -84,10 +78,6 @@ class Search:
 
     def _guides(self, x: np.ndarray) -> np.ndarray:
         return np.c_[x.reshape(-1, 2), np.zeros(len(x) // 2)].astype(np.float32) * np.float32(self._radius_mm)
-
-    def _candidate_loss(self, chosen: tuple[int, ...]) -> float:
-        visible = np.stack([self._visible[k] for k in chosen], axis=1)
-        return self._fitted_loss(self._candidates[list(chosen)], visible)
 
     def _loss(self, guides_mm: np.ndarray) -> float:
         visible = np.ones((len(self._probe), len(guides_mm)), bool)

@@ -15,11 +15,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
+from scipy.linalg import block_diag
 
 from endotwin.effects.vignetting import squared_radius
 from endotwin.light.guides import AT_LENS, COSINE, guided, log_axis, visible_from
 from endotwin.pixels.fixed_effects import Design, FixedEffects, regress, robust_losses
-from endotwin.pixels.start import PRIOR, diffuse
+from endotwin.pixels.start import LIGHT_MEAN, LIGHT_SPREAD, PRIOR, diffuse
 from endotwin.surface.vectors import unit
 
 if TYPE_CHECKING:
@@ -39,6 +40,10 @@ MIN_SIGMAS = 4.0
 """An effect is kept where it lowers the held-out error by so much, and by so many of its own
 uncertainties. Of the scenes that were tried, those without an effect show at most 0.19 dB of it, 0.04 dB
 where no light is bounced; those that have it at least 0.57 dB."""
+
+VIGNETTING_SPREAD = 0.3
+"""Prior standard deviation of γ·k2 and γ·k4 about 0. Like that of γn, γq and γ it counts against one
+observation a vertex: what the model lacks errs alike in all pixels of one."""
 
 POSSIBLE = ((0.1, 2.0), (-1.0, 12.0), (-0.5, 7.0))
 """Bounds of γ, n and q, with room for their errors: beyond, few pixels were explained by many things."""
@@ -225,9 +230,10 @@ class Probe:
 
     def with_columns(self, base: Fitted, columns: np.ndarray) -> Fitted:
         """``base`` with free ``columns`` [N, K] beside its own: what an effect would do to first order."""
-        return self._fitted(
-            base.hypothesis, replace(base.design, columns=np.c_[base.design.columns, columns])
-        )
+        precision, pull = base.design.prior
+        prior = block_diag(precision, np.zeros((columns.shape[1],) * 2)), np.r_[pull, np.zeros(columns.shape[1])]
+        design = replace(base.design, columns=np.c_[base.design.columns, columns], prior=prior)
+        return self._fitted(base.hypothesis, design)
 
     def loss(self, hypothesis: Hypothesis, base: Fitted, visible: np.ndarray | None = None) -> float:
         """Robust loss of all pixels, linearised about ``base``, under guides that see them as ``visible`` [N,
@@ -246,9 +252,15 @@ class Probe:
         return Fitted(hypothesis, design, regress(self.target, design, len(self.frames)))
 
     def _design(self, hypothesis: Hypothesis, columns: np.ndarray) -> Design:
+        mean, spread = list(LIGHT_MEAN), list(LIGHT_SPREAD)
         if hypothesis.vignetting:
             columns = np.c_[columns, self.vignetting_columns]
-        return Design(columns, self.vertex, self.count, self.frame if hypothesis.gain else None)
+            mean, spread = [*mean, 0.0, 0.0], [*spread, VIGNETTING_SPREAD, VIGNETTING_SPREAD]
+        precision = len(self) / max(self.count, 1) / np.square(spread)
+        prior = np.diag(precision), precision * mean
+        return Design(
+            columns, self.vertex, self.count, self.frame if hypothesis.gain else None, prior=prior
+        )
 
     def _interpolated(self, per_vertex: np.ndarray) -> np.ndarray:
         corners = per_vertex[self.twin.surface.triangles[self.samples.triangle.numpy()]]

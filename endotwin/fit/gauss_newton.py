@@ -23,7 +23,7 @@ from endotwin.fit.model import Globals, at_pixels, predict
 from endotwin.fit.normal_equations import CHANNELS, MeshPattern, NormalEquations, assemble, robust_cost
 from endotwin.light.shading import F0_DIELECTRIC
 from endotwin.pixels.samples import Samples, drawn
-from endotwin.pixels.start import PRIOR
+from endotwin.pixels.start import LIGHT_MEAN, LIGHT_SPREAD
 
 NOISE_MIN = 1 / 255
 """Least noise assumed, in display values: 8-bit rounding and a step of sensor noise."""
@@ -41,15 +41,8 @@ ROUGHNESS_SPREAD = 0.1
 
 COARSE_MM = 12.0
 
-GLOBAL_MEAN = (
-    0.0,
-    PRIOR["gamma"] * PRIOR["n"],
-    PRIOR["gamma"] * PRIOR["q"],
-    PRIOR["gamma"],
-    math.log(F0_DIELECTRIC),
-    0.0,
-)
-GLOBAL_SPREAD = (5.0, 0.5, 0.25, 0.1, 0.5, 0.5)
+GLOBAL_MEAN = (0.0, *LIGHT_MEAN, math.log(F0_DIELECTRIC), 0.0)
+GLOBAL_SPREAD = (5.0, *LIGHT_SPREAD, 0.5, 0.5)
 GLOBAL_RANGE = ((-20.0, 20.0), (0.0, 10.0), (0.0, 4.0), (0.15, 1.5), (-6.0, -0.7), (-1.5, 1.5))
 """Prior and bounds of the shared parameters, in the order of BOUNCE_GLOBALS."""
 

@@ -4,6 +4,10 @@ light.
 The surface is gathered into patches. Once, cosine-weighted rays from each patch count which patches it sees:
 the form factors K (Goral et al. 1984; Monte Carlo estimate, Cohen & Wallace 1993, ch. 4). Then the indirect
 irradiance E under any light is E = K·ρ(E_direct + E), a few sparse products a bounce.
+
+A lumen is closed, and a mesh of what depth maps showed is not: from half of a wall's directions comes light
+of tissue that nobody saw. It is taken to be like the tissue that is seen from there, in less light: UNSEEN_DIRECT
+of the direct irradiance (a light that lies where the camera does hardly reaches it) and UNSEEN_INDIRECT of the indirect one.
 """
 
 from __future__ import annotations
@@ -38,6 +42,13 @@ a fold."""
 LIFT = 1e-3
 """Rays start this share of a patch's size above it."""
 
+UNSEEN_DIRECT, UNSEEN_INDIRECT = 0.1, 0.8
+"""Against whole path-traced colons these bring the bounce from a mesh of what was seen from 36 % (red) and 65 % (green)
+of its strength to within 6 %, and halve its error from place to place; a convex hull about the mesh does worse."""
+
+LEAST_SEEN = 0.1
+"""Share of its directions that a patch must see something in for that to stand for the rest."""
+
 BOUNCES = 12
 ALBEDO_MAX = 0.95
 """With twelve bounces at most 0.95¹² = 54 % of an impossible furnace is missing; tissue (below 0.8) loses
@@ -63,7 +74,8 @@ class Radiosity:
     Attributes:
         cell_mm: size of the patches. patch_of: int [F], patch of each triangle.
         centre_mm: float32 [P, 3], local frame.
-        form_factors: CSR [P, P], rows sum to at most 1 (less where the tube is open).
+        form_factors: CSR [P, P], rows sum to at most 1 (less where the mesh is open).
+        unseen: float32 [P], directions in which a patch meets nothing for each in which it does.
     """
 
     def __init__(self, surface: Surface, caster: Caster, cell_mm: float, rays: int = RAYS, seed: int = 0):
@@ -80,6 +92,8 @@ class Radiosity:
         self._area = double_area / 2
         self._draw = _Draw(self.patch_of, double_area, self.count)
         self.form_factors = self._counted(corners, normal, rays, generator)
+        met = np.asarray(self.form_factors.sum(axis=1)).ravel()
+        self.unseen = ((1 - met) / np.maximum(met, LEAST_SEEN)).astype(np.float32)
         triangle = self._draw(POINTS, generator)
         self._points_mm = _inside(corners[triangle], generator)
         self._normals = normal[triangle]
@@ -145,11 +159,17 @@ class Radiosity:
     def indirect(self, direct: np.ndarray, albedo: np.ndarray) -> np.ndarray:
         """Indirect irradiance float32 [P, M, 3] of ``direct`` [P, M] light, with patch ``albedo`` [P, 3]."""
         albedo = np.clip(albedo, 0, ALBEDO_MAX).astype(np.float32)[:, None]
-        source = direct[..., None].astype(np.float32)
-        bounced = np.zeros((*direct.shape, 3), np.float32)
-        for _ in range(BOUNCES):
-            radiosity = (albedo * (source + bounced)).reshape(self.count, -1)
-            bounced = (self.form_factors @ radiosity).reshape(bounced.shape)
+        unseen = self.unseen[:, None, None]
+
+        def thrown(irradiance: np.ndarray, unseen_share: float) -> np.ndarray:
+            radiosity = (albedo * irradiance).reshape(self.count, -1)
+            met = (self.form_factors @ radiosity).reshape(irradiance.shape)
+            return met * (1 + unseen_share * unseen)
+
+        first = thrown(np.repeat(direct[..., None].astype(np.float32), 3, axis=2), UNSEEN_DIRECT)
+        bounced = first
+        for _ in range(BOUNCES - 1):
+            bounced = first + thrown(bounced, UNSEEN_INDIRECT)
         return bounced
 
     def mean(self, per_triangle: np.ndarray) -> np.ndarray:

@@ -21,6 +21,10 @@ from endotwin.twin import Light, Response
 PRIOR = {"n": 2.0, "q": 2.0, "gamma": 1 / 2.2}
 """A bare fibre is about Lambertian with inverse-square falloff; cameras encode for a display of gamma 2.2."""
 
+LIGHT_MEAN = (PRIOR["gamma"] * PRIOR["n"], PRIOR["gamma"] * PRIOR["q"], PRIOR["gamma"])
+LIGHT_SPREAD = (0.5, 0.25, 0.1)
+"""Prior of γn, γq and γ, in which a diffuse surface's log C is linear: mean and standard deviation."""
+
 BRIGHT, DARK = 250, 5
 """Display values beyond which a photo says little about log radiance."""
 

@@ -18,6 +18,8 @@ SURROUND_FRAMES = 8
 SURROUND_LEVEL = 3  # of 255, the brightest that noise makes a black pixel
 SURROUND_AREA = 0.002  # of the image, the least that counts as a surround
 ISLAND_AREA = 0.01
+RINGING_SHARE = 0.25  # of the lit image's median: what a codec's ringing may reach beside the lens circle
+RINGING_PX = 16  # how far it reaches: a block whose chroma is stored at half size
 DEPTH_SPREAD = 0.02
 
 
@@ -164,7 +166,8 @@ def dark_surround(brightest: np.ndarray) -> np.ndarray:
     """Bool [H, W]: the black around a lens circle, from the brightest value uint8 [H, W] of each pixel.
 
     Only large dark regions joined to the image's border count: the dark far end of a lumen is kept. Small
-    bright islands within the surround (hot pixels, text) belong to it.
+    bright islands within the surround (hot pixels, text) belong to it, and so does the ringing of a lossy
+    codec between it and the circle.
     """
     dark = (brightest <= SURROUND_LEVEL).astype(np.uint8)
     _, labels, stats, _ = cv2.connectedComponentsWithStats(dark, connectivity=4)
@@ -174,10 +177,19 @@ def dark_surround(brightest: np.ndarray) -> np.ndarray:
     ]
     if not large:
         return np.zeros(dark.shape, bool)
-    surround = np.isin(labels, large)
+    surround = _with_ringing(np.isin(labels, large), brightest)
     _, labels, stats, _ = cv2.connectedComponentsWithStats((~surround).astype(np.uint8), connectivity=4)
     islands = stats[:, cv2.CC_STAT_AREA] < ISLAND_AREA * dark.size
     return surround | islands[labels]
+
+
+def _with_ringing(surround: np.ndarray, brightest: np.ndarray) -> np.ndarray:
+    """``surround`` bool [H, W] grown over what is dim, beside the image's lit part, within RINGING_PX of it."""
+    dim = brightest <= max(SURROUND_LEVEL, RINGING_SHARE * np.median(brightest[~surround]))
+    distance_px = cv2.distanceTransform((~surround).astype(np.uint8), cv2.DIST_L2, 5)
+    near = surround | (dim & (distance_px <= RINGING_PX))
+    _, labels = cv2.connectedComponents(near.astype(np.uint8), connectivity=4)
+    return np.isin(labels, np.unique(labels[surround]))
 
 
 def resized_depth(depth_mm: np.ndarray, width: int, height: int) -> np.ndarray:
