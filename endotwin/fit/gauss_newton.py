@@ -23,7 +23,7 @@ from endotwin.fit.model import Globals, at_pixels, predict
 from endotwin.fit.normal_equations import CHANNELS, MeshPattern, NormalEquations, assemble, robust_cost
 from endotwin.light.shading import F0_DIELECTRIC
 from endotwin.pixels.samples import Samples, drawn
-from endotwin.pixels.start import LIGHT_MEAN, LIGHT_SPREAD
+from endotwin.pixels.start import LIGHT_MEAN, LIGHT_SPREAD, PRIOR
 
 NOISE_MIN = 1 / 255
 """Least noise assumed, in display values: 8-bit rounding and a step of sensor noise."""
