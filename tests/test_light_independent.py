@@ -8,9 +8,9 @@ import torch
 from independent.gloss import Gloss
 from independent.light import Lamp, burley, dot, ggx
 
-from endotwin import shading
-from endotwin.guides import AT_LENS, COSINE, EXPONENTIAL, guided
-from endotwin.incidence import unit
+from endotwin.light import shading
+from endotwin.light.guides import AT_LENS, COSINE, EXPONENTIAL, guided
+from endotwin.surface.vectors import unit
 
 BESIDE = ((3.2, 0.5, 0.0), (-2.8, 2.7, -1.0), (-1.3, -3.1, 0.0))
 

@@ -7,9 +7,6 @@ from typing import ClassVar
 
 from endotwin.effects.effect import Effect, parameter
 
-F0_WATER = 0.02
-"""((1.33 − 1) / (1.33 + 1))²."""
-
 
 @dataclass(frozen=True)
 class Coat(Effect):

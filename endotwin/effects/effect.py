@@ -39,6 +39,11 @@ class Effect:
 
     name: ClassVar[str]
 
+    def __str__(self) -> str:
+        """The name, and the scalar parameters with their values."""
+        told = ", ".join(f"{each.name} {getattr(self, each.name):.4g}" for each in self.parameters())
+        return f"{self.name} ({told})" if told else self.name
+
     @classmethod
     def parameters(cls) -> tuple[Parameter, ...]:
         """The scalar parameters, in the order of the fields."""

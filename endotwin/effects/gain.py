@@ -26,6 +26,11 @@ class Gain(Effect):
     frames: tuple[int, ...] = ()
     log_gain: tuple[float, ...] = ()
 
+    def __str__(self) -> str:
+        if not self.frames:
+            return self.name
+        return f"{self.name} (×{np.exp(min(self.log_gain)):.2f} to ×{np.exp(max(self.log_gain)):.2f})"
+
     def of(self, frame: np.ndarray) -> np.ndarray:
         """Gain of frames [N], measured or not, float32 [N]; 1 where none was measured at all."""
         return np.exp(self._log_of(frame)).astype(np.float32)

@@ -17,3 +17,7 @@ class Offset(Effect):
 
     name: ClassVar[str] = "offset"
     guides_mm: tuple[tuple[float, float, float], ...] = ()
+
+    def __str__(self) -> str:
+        guides = ", ".join(f"({x:.2f}, {y:.2f}, {z:.2f})" for x, y, z in self.guides_mm)
+        return f"{self.name} (guides at {guides} mm)"

@@ -23,7 +23,7 @@ from endotwin.fit.model import Globals, at_pixels, predict
 from endotwin.fit.normal_equations import CHANNELS, MeshPattern, NormalEquations, assemble, robust_cost
 from endotwin.light.shading import F0_DIELECTRIC
 from endotwin.pixels.samples import Samples, drawn
-from endotwin.pixels.start import LIGHT_MEAN, LIGHT_SPREAD
+from endotwin.pixels.start import LIGHT_MEAN, LIGHT_SPREAD, PRIOR
 
 NOISE_MIN = 1 / 255
 """Least noise assumed, in display values: 8-bit rounding and a step of sensor noise."""
@@ -45,6 +45,11 @@ GLOBAL_MEAN = (0.0, *LIGHT_MEAN, math.log(F0_DIELECTRIC), 0.0)
 GLOBAL_SPREAD = (5.0, *LIGHT_SPREAD, 0.5, 0.5)
 GLOBAL_RANGE = ((-20.0, 20.0), (0.0, 10.0), (0.0, 4.0), (0.15, 1.5), (-6.0, -0.7), (-1.5, 1.5))
 """Prior and bounds of the shared parameters, in the order of BOUNCE_GLOBALS."""
+
+USUAL_SIGMAS = 3.0
+AT_EDGE = 0.01
+"""Beyond so many standard deviations of the prior, and so near an edge of their range in shares of one, n, q
+and γ are no endoscope's."""
 
 DARKEST_LOG_SCALE = -1.2
 """With albedos scaled by less than e to this the brightest tissue would reflect a quarter of the light."""
@@ -317,10 +322,21 @@ def global_prior(unit_mm: float, count: int) -> tuple[Tensor, Tensor]:
     return mean, spread
 
 
-def at_bounds(shared: Globals) -> list[str]:
-    """Which of n, q and gamma lie on an edge of their range."""
-    told = {"n": 1, "q": 2, "gamma": 3}
-    return [name for name, index in told.items() if float(shared.vector[index]) in GLOBAL_RANGE[index]]
+def unusual(shared: Globals) -> list[str]:
+    """Those of n, q and γ, with what is usual, that lie more than USUAL_SIGMAS of the prior from its mean, or
+    at an edge of their range."""
+    _, n, q = shared.log_light
+    found = []
+    for index, name, value in ((1, "n", n), (2, "q", q), (3, "γ", shared.gamma)):
+        scale = 1.0 if name == "γ" else PRIOR["gamma"]
+        mean, spread = GLOBAL_MEAN[index] / scale, GLOBAL_SPREAD[index] / scale
+        low, high = max(0.0, mean - USUAL_SIGMAS * spread), mean + USUAL_SIGMAS * spread
+        from_edge = min(abs(float(shared.vector[index]) - edge) for edge in GLOBAL_RANGE[index])
+        at_edge = from_edge < AT_EDGE * GLOBAL_SPREAD[index]
+        if at_edge or not low <= value <= high:
+            edge = "the edge of what is tried, " if at_edge else ""
+            found.append(f"{name} {value:.3f} ({edge}usually {low:.3f} to {high:.3f})")
+    return found
 
 
 def darkest(shared: Globals) -> bool:

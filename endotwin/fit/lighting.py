@@ -53,7 +53,6 @@ def _log_exposure(samples: Samples, effects: Effects) -> Tensor:
 def _guided(samples: Samples, surface: Surface, caster: Caster, effects: Effects) -> Guided:
     """How the guides light the samples, view by view."""
     views, guides_mm = samples.views, np.asarray(effects.guides_mm, np.float32)
-    directions = views.camera.pixel_directions.reshape(-1, 3)
     view = views.row(samples.frame)
     order = np.argsort(view, kind="stable")
     found = {
@@ -62,14 +61,13 @@ def _guided(samples: Samples, surface: Surface, caster: Caster, effects: Effects
     for rows in np.split(order, np.flatnonzero(np.diff(view[order])) + 1):
         part = samples[torch.from_numpy(rows)]
         pose = views.T_local_camera[view[rows[0]]]
-        points_mm = directions[part.pixel.numpy()] * part.log_distance.exp().numpy()[:, None]
         corners = surface.normals[surface.triangles[part.triangle.numpy()]]
         normals = np.einsum("nk,nka->na", part.barycentric.numpy(), corners)
         normals = unit(normals @ pose[:3, :3].astype(np.float32))
         visible = None
         if "shadows" in effects:
-            visible = visible_from(caster, pose, points_mm, guides_mm)
-        for name, value in vars(guided(points_mm, normals, guides_mm, effects.profile, visible)).items():
+            visible = visible_from(caster, pose, part.points_mm, guides_mm)
+        for name, value in vars(guided(part.points_mm, normals, guides_mm, effects.profile, visible)).items():
             found[name][rows] = value.numpy()
     return Guided(**{name: torch.from_numpy(value) for name, value in found.items()})
 

@@ -22,9 +22,9 @@ from endotwin.evidence.decide import decide
 from endotwin.fit.gauss_newton import (
     GaussNewton,
     State,
-    at_bounds,
     darkest,
     roughness_to_raw,
+    unusual,
 )
 from endotwin.fit.hashgrid import HashGrid, HashOperator
 from endotwin.fit.lighting import Relighting, lit
@@ -143,12 +143,12 @@ def fit_twin(twin: Twin, pace: Pace, seed: int, states: Mapping[str, str], price
     with stopwatch.stage("detail"):
         state, normals = _find_detail(samples, twin, state, cost, pace, relighting)
         twin = replace(twin, surface=replace(surface, normals=normals))
-    stuck = at_bounds(state.shared)
-    if stuck:
+    odd = unusual(state.shared)
+    if odd:
         logger.warning(
-            "the fit ended at the bound of %s, as it does on wrong poses, depth or photos: do not trust it; "
-            "'endotwin check %s' looks for the cause",
-            *(" and ".join(stuck), twin.source.path),
+            "the fit ended at %s, as it does on wrong poses, depth or photos, or without an effect that they "
+            "show: do not trust it; 'endotwin check %s' looks for the cause",
+            *(" and ".join(odd), twin.source.path),
         )
     with stopwatch.stage("price"):
         decisions = {**decided.decisions, "coat": coat}

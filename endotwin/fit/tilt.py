@@ -70,10 +70,9 @@ def _assembled(
     count = len(pattern.corners)
     sums, right = np.zeros((count, 6, 6), np.float32), np.zeros((count, 3, 3), np.float32)
     rotations = samples.views.T_local_camera[:, :3, :3].astype(np.float32)
-    rays = samples.views.camera.pixel_directions.reshape(-1, 3)
     materials, corner_normals = state.materials, torch.from_numpy(normals)
     for start, part in zip(range(0, len(samples), CHUNK), samples.chunks(CHUNK), strict=True):
-        rotation, view = rotations[part.views.row(part.frame)], rays[part.pixel.numpy()]
+        rotation, view = rotations[part.views.row(part.frame)], part.directions
         normal = at_pixels(part, triangles, corner_normals).numpy()
         normal = unit(np.einsum("na,nab->nb", normal, rotation))
         material = at_pixels(part, triangles, materials)
@@ -104,9 +103,8 @@ def _seen(samples: Samples, normal: np.ndarray, view: np.ndarray, effects: Effec
     tangential = normal + cos[:, None] * view
     guides = samples.guides
     if guides is not None:
-        points_mm = view * samples.log_distance.exp().numpy()[:, None]
         visible = (guides.cos_i > 0).numpy()
-        guides = guided(points_mm, normal, np.asarray(effects.guides_mm), effects.profile, visible)
+        guides = guided(samples.points_mm, normal, np.asarray(effects.guides_mm), effects.profile, visible)
     return replace(
         samples,
         cos=torch.from_numpy(np.maximum(cos, COS_MIN)),

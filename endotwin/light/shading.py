@@ -20,6 +20,9 @@ from torch import Tensor
 F0_DIELECTRIC = 0.04
 """Reflectance of tissue at normal incidence: ((1.5 - 1) / (1.5 + 1))², Burley's ``specular`` 0.5."""
 
+F0_WATER = 0.02
+"""((1.33 − 1) / (1.33 + 1))²."""
+
 ROUGHNESS_TISSUE = 0.4
 """Roughness of tissue where nothing tells it yet."""
 

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from endotwin.cameras.base import Camera
 from endotwin.light.bounced import Bounce
+from endotwin.light.forward import Lit
 from endotwin.light.guides import Guided
 from endotwin.light.incidence import incidence
 from endotwin.pixels.length_unit import unit_mm
@@ -90,6 +91,25 @@ class Samples:
     def __getitem__(self, index) -> Samples:
         rows = {name: value for name, value in vars(self).items() if value is not None and name != "views"}
         return replace(self, **{name: value[index] for name, value in rows.items()})
+
+    @property
+    def directions(self) -> np.ndarray:
+        """Unit viewing rays in the camera frame, float32 [N, 3]."""
+        return self.views.camera.pixel_directions.reshape(-1, 3)[self.pixel.numpy()]
+
+    @property
+    def points_mm(self) -> np.ndarray:
+        """Surface points in the camera frame, float32 [N, 3]."""
+        return self.directions * self.log_distance.exp().numpy()[:, None]
+
+    def lit(self, n: float, q: float, log_scale: float = 0.0) -> Lit:
+        """What lights the pixels, where the light's n and q and the albedo's scale say what is bounced."""
+        more = {"log_exposure": self.log_exposure}
+        if self.bounce is not None:
+            more |= {"irradiance": self.bounce.irradiance(n, q, log_scale), "gloss": self.bounce.gloss}
+        if self.guides is not None:
+            return Lit(self.cos, self.guides, **more)
+        return Lit.at_lens(self.cos, self.sin2, self.log_cos_axis, self.log_distance, **more)
 
     def thinned(self, count: int, generator: np.random.Generator) -> Samples:
         """About ``count`` of the samples, drawn evenly at random; all of them if there are no more."""

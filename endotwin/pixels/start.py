@@ -11,9 +11,8 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 
-from endotwin.light import shading
+from endotwin.light.forward import Lit, Lobes, shares
 from endotwin.pixels.fixed_effects import HUBER, without_means
 from endotwin.pixels.samples import Samples
 from endotwin.twin import Light, Response
@@ -45,6 +44,8 @@ RCOND = 1e-9
 
 ALBEDO_TOP = 0.8
 """The scale that light and albedo share is fixed by the 98th percentile of the brightest albedo channel."""
+
+LAMBERT = Lobes(f0=0.0, burley=False)
 
 ALBEDO_MIDDLE = 0.6
 """The start fixes it by the median, since the brightest of its noisy albedos are no tissue's."""
@@ -174,10 +175,8 @@ def _albedo(samples: Samples, vertex: np.ndarray, count: int, light: Light, gamm
     """Mean albedo of each vertex [V, 3] under a diffuse model with L0 = 1; the median where there is no
     sample.
     """
-    log_strength = shading.log_spotlight(
-        torch.tensor(math.log(light.L0)), light.n, light.q, samples.log_cos_axis, samples.log_distance
-    )
-    strength = torch.exp(log_strength) * samples.cos * 2
+    lit = Lit.at_lens(samples.cos, samples.sin2, samples.log_cos_axis, samples.log_distance)
+    strength = shares(lit, (math.log(light.L0), light.n, light.q), samples.cos, LAMBERT)[0].per_color
     linear = (samples.color.float().clamp_min(1) / 255) ** (1 / gamma)
     # Least squares of linear = strength·b: a pixel counts by its light, so grazing and distant ones do not
     # add noise.

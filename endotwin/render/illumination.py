@@ -4,16 +4,16 @@ light."""
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from endotwin.effects.coat import F0_WATER
 from endotwin.light import shading
 from endotwin.light.bounced import Albedo, BouncedLight, Places
-from endotwin.light.guides import AT_LENS, COSINE, Guided, guided, log_axis, visible_from
+from endotwin.light.forward import Lit, Lobes, radiance
+from endotwin.light.guides import AT_LENS, COSINE, guided, log_axis, visible_from
 from endotwin.light.incidence import COS_MIN, incidence_on
 from endotwin.light.radiosity import Radiosity
 from endotwin.surface.casting import Caster, Correspondences
@@ -88,71 +88,42 @@ class ViewLight:
         Returns:
             float32 [N, 3]; and which guides each point sees, float32 [N, K] (None where no shadow is cast).
         """
-        diffuse = shading.diffuse(material[:, :3], material[:, 4])
-        visible = None
-        if self.twin.effects.guides_mm is None:
-            x = self._at_lens(hits, directions, normals, diffuse, material[:, 3])
-        else:
-            points_mm = directions.reshape(-1, 3).take(hits.pixel, axis=0) * hits.distance_mm[:, None]
-            guides_mm = np.asarray(self.twin.effects.guides_mm, np.float32)
-            if "shadows" in self.twin.effects:
-                visible = visible_from(self.caster, self.T_local_camera, points_mm, guides_mm)
-            lit = guided(points_mm, normals, guides_mm, self.twin.effects.profile, visible)
-            cos_o = _cos_o(hits, directions, normals)
-            x = self._beside_lens(lit, cos_o, diffuse, material[:, 3])
+        twin, roughness = self.twin, material[:, 3]
+        more = {}
         if self.irradiance is not None:
-            bounced = torch.from_numpy(hits.interpolate(self.twin.surface, self.irradiance))
-            cos_o = _cos_o(hits, directions, normals)
-            glossy = shading.specular_of_even_light(cos_o, material[:, 3], self.twin.materials.f0)[:, None]
-            x = x + bounced * (diffuse + glossy / math.pi) * (2 * math.pi * self.twin.light.L0)
-        return x, visible
+            gloss = shading.specular_of_even_light(
+                _cos_o(hits, directions, normals), roughness, twin.materials.f0
+            )
+            bounced = torch.from_numpy(hits.interpolate(twin.surface, self.irradiance))
+            more = {"irradiance": bounced, "gloss": gloss}
+        lit, visible = self._lit(hits, directions, normals, more)
+        log_light = (math.log(max(twin.light.L0, 1e-30)), twin.light.n, twin.light.q)
+        base_color = material[:, :3] * (1 - material[:, 4:])
+        return radiance(lit, log_light, base_color, roughness, _lobes(twin)), visible
 
-    def _at_lens(
-        self,
-        hits: Correspondences,
-        directions: np.ndarray,
-        normals: np.ndarray,
-        diffuse: Tensor,
-        roughness: Tensor,
-    ) -> Tensor:
-        geometry = incidence_on(normals, hits, directions)
-        cos, sin2, cone, distance = (torch.from_numpy(value) for value in vars(geometry).values())
-        if self.twin.effects.profile != COSINE:
-            cone = torch.from_numpy(log_axis(np.exp(geometry.log_cos_axis), self.twin.effects.profile))
-        strength = self._strength(cone, distance) * cos
-        if self.twin.materials.diffuse == "burley":
-            diffuse = diffuse * shading.burley(cos, cos, torch.ones_like(cos), roughness)[:, None]
-        for f0, rough in self._lobes(roughness):
-            diffuse = diffuse + f0 * shading.specular_colocated(cos, sin2, rough)[:, None]
-        return diffuse * strength[:, None]
+    def _lit(
+        self, hits: Correspondences, directions: np.ndarray, normals: np.ndarray, more: dict[str, Tensor]
+    ) -> tuple[Lit, np.ndarray | None]:
+        """What lights the hits, with what comes from other tissue in ``more``; and which guides they see."""
+        effects = self.twin.effects
+        if effects.guides_mm is None:
+            geometry = incidence_on(normals, hits, directions)
+            if effects.profile != COSINE:
+                axis = log_axis(np.exp(geometry.log_cos_axis), effects.profile)
+                geometry = replace(geometry, log_cos_axis=axis)
+            return Lit.at_lens(*(torch.from_numpy(value) for value in vars(geometry).values()), **more), None
+        points_mm = directions.reshape(-1, 3).take(hits.pixel, axis=0) * hits.distance_mm[:, None]
+        guides_mm, visible = np.asarray(effects.guides_mm, np.float32), None
+        if "shadows" in effects:
+            visible = visible_from(self.caster, self.T_local_camera, points_mm, guides_mm)
+        guides = guided(points_mm, normals, guides_mm, effects.profile, visible)
+        return Lit(_cos_o(hits, directions, normals), guides, **more), visible
 
-    def _beside_lens(self, lit: Guided, cos_o: Tensor, diffuse: Tensor, roughness: Tensor) -> Tensor:
-        count = lit.cos_i.shape[1]
-        x = torch.zeros_like(diffuse)
-        for k in range(count):
-            cos_i = lit.cos_i[:, k]
-            answer = diffuse
-            if self.twin.materials.diffuse == "burley":
-                answer = answer * shading.burley(cos_i, cos_o, lit.cos_d[:, k], roughness)[:, None]
-            for f0, rough in self._lobes(roughness):
-                answer = answer + f0 * shading.specular_lobe(cos_i, cos_o, lit.sin2_m[:, k], rough)[:, None]
-            strength = self._strength(lit.log_axis[:, k], lit.log_distance[:, k])
-            x += answer * (strength * cos_i / count)[:, None]
-        return x
 
-    def _strength(self, cone: Tensor, distance: Tensor) -> Tensor:
-        """2π·L of the points, [N]."""
-        light = self.twin.light
-        log_L0 = math.log(max(light.L0, 1e-30))
-        return torch.exp(shading.log_spotlight(log_L0, light.n, light.q, cone, distance)) * (2 * math.pi)
-
-    def _lobes(self, roughness: Tensor) -> list[tuple[float, Tensor]]:
-        """f0 and roughness [N] of each specular lobe."""
-        lobes = [(self.twin.materials.f0, roughness)] if self.twin.materials.f0 > 0 else []
-        if "coat" in self.twin.effects:
-            coat = self.twin.effects["coat"]
-            lobes.append((coat.weight * F0_WATER, torch.full_like(roughness, coat.roughness)))
-        return lobes
+def _lobes(twin: Twin) -> Lobes:
+    coat = twin.effects.get("coat")
+    wet = None if coat is None else (coat.weight, coat.roughness)
+    return Lobes(twin.materials.f0, twin.materials.diffuse == "burley", wet)
 
 
 def _albedo(twin: Twin, radiosity: Radiosity) -> np.ndarray:

@@ -195,8 +195,8 @@ def _with_ringing(surround: np.ndarray, brightest: np.ndarray) -> np.ndarray:
 def resized_depth(depth_mm: np.ndarray, width: int, height: int) -> np.ndarray:
     """Depth [h, w] on another pixel grid: the mean where source pixels agree, else the nearest one's value.
 
-    Pixels agree when all are valid and lie within ``DEPTH_SPREAD`` of the depth. Depths either side of a
-    fold's rim are thus never blended into a depth where there is nothing.
+    Pixels agree when all are valid and of ``one_surface``. Depths either side of a fold's rim are thus never
+    blended into a depth where there is nothing.
     """
     native_height, native_width = depth_mm.shape
     rows = _nearest(native_height, height)
@@ -214,7 +214,13 @@ def resized_depth(depth_mm: np.ndarray, width: int, height: int) -> np.ndarray:
         (width, height),
         interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR,
     )
-    return np.where(most * (1 - DEPTH_SPREAD) <= least, mean, nearest).astype(np.float32)
+    return np.where(one_surface(least, most), mean, nearest).astype(np.float32)
+
+
+def one_surface(least: np.ndarray, most: np.ndarray) -> np.ndarray:
+    """Whether neighbouring pixels with depths (or distances) from ``least`` to ``most`` may be blended, bool
+    of their shape: not where they lie either side of a fold's rim, nor where one has none (NaN or inf)."""
+    return most - least <= DEPTH_SPREAD * least
 
 
 def _nearest(native: int, new: int) -> np.ndarray:

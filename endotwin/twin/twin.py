@@ -136,6 +136,7 @@ class Twin:
                 f"light: L0 {self.light.L0:.4g}, n {self.light.n:.3f}, q {self.light.q:.3f}; "
                 f"γ {self.response.gamma:.4f}, f0 {self.materials.f0:.3f}"
             )
+            lines.append(f"effects: {', '.join(map(str, self.effects.values())) or 'none'}")
         else:
             lines.append("not fitted")
         scores = self.record.get("eval")
