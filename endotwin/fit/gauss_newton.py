@@ -54,6 +54,10 @@ and γ are no endoscope's."""
 DARKEST_LOG_SCALE = -1.2
 """With albedos scaled by less than e to this the brightest tissue would reflect a quarter of the light."""
 
+BRIGHTEST = 0.9
+"""Share of the light that the brightest tissue may reflect: a mesh that lacks what throws light on it asks
+for more, until the tissue would be a furnace."""
+
 COLOR_RANGE = (1e-3, 2.0)
 
 CG_TOLERANCE = 1e-3
@@ -342,6 +346,18 @@ def unusual(shared: Globals) -> list[str]:
 def darkest(shared: Globals) -> bool:
     """Whether light between tissue asks for darker tissue than there is."""
     return shared.log_scale <= DARKEST_LOG_SCALE
+
+
+def without_furnace(state: State) -> State:
+    """``state`` with the albedo's scale such that the brightest tissue (98th percentile) reflects at most
+    BRIGHTEST."""
+    brightest = float(np.percentile(state.materials[:, :3].amax(dim=1).numpy(), 98))
+    limit = math.log(BRIGHTEST / brightest)
+    if state.shared.log_scale <= limit:
+        return state
+    vector = state.shared.vector.clone()
+    vector[-1] = limit
+    return replace(state, shared=replace(state.shared, vector=vector))
 
 
 def bounded(shared: Globals, vector: Tensor) -> Globals:

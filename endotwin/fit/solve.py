@@ -25,6 +25,7 @@ from endotwin.fit.gauss_newton import (
     darkest,
     roughness_to_raw,
     unusual,
+    without_furnace,
 )
 from endotwin.fit.hashgrid import HashGrid, HashOperator
 from endotwin.fit.lighting import Relighting, lit
@@ -197,14 +198,16 @@ def _find_light(
     ready = pace.stopwatch.total
     state, _ = solver.step(state, joint=False)
     step_s = pace.stopwatch.total - ready
-    steps = BOUNCE_STEPS if relighting.bounces else LIGHT_STEPS
-    judged = Decision("off", "no time to judge")
-    for number in range(steps):
+    number, steps = 0, BOUNCE_STEPS if relighting.bounces else LIGHT_STEPS
+    judged = None
+    while number < steps:
         late = pace.left(LIGHT) <= 2 * step_s
         if late and (relighting.bounces or number):
             break
-        if relighting.bounces and darkest(state.shared):
-            state = relighting.without_bounce(solver, state)
+        if relighting.bounces:
+            state = without_furnace(state)
+            if darkest(state.shared):
+                state, steps = relighting.without_bounce(solver, state), number + LIGHT_STEPS
         relighting(solver, state)
         within = Within.of(solver.samples, surface, unit)
         material = at_pixels(solver.samples, solver.triangles, state.materials)
@@ -220,10 +223,14 @@ def _find_light(
         if late:
             break
         state, gain = solver.step(state, joint=relighting.bounces)
-        pace.report("find the light", number + 1, steps)
+        number += 1
+        pace.report("find the light", number, steps)
         if gain < CONVERGED * solver.cost(state, solver.noise(state)):
-            break
-    return state, _Cost(ready - began, step_s, len(points) * len(operator.cells_mm), len(samples)), judged
+            number = max(number, COAT_STEP) if judged is None else steps
+    if relighting.bounces:
+        state = without_furnace(state)
+    cost = _Cost(ready - began, step_s, len(points) * len(operator.cells_mm), len(samples))
+    return state, cost, judged or Decision("off", "no time to judge")
 
 
 def _find_detail(
