@@ -37,6 +37,17 @@ def test_a_picture_without_a_surround_is_kept_whole_although_its_corner_pixels_a
     assert not dark_surround(image).any()
 
 
+def test_a_codecs_ringing_beside_the_lens_circle_is_not_the_lens_nor_is_the_circles_halo():
+    image, disc = circle_image(480, 640, 200)
+    photo = cv2.GaussianBlur(np.uint8([120, 150, 230]) * np.uint8(disc)[..., None], (0, 0), 0.5)
+    coded = cv2.imencode(".jpg", photo, [cv2.IMWRITE_JPEG_QUALITY, 90])[1]
+    ringing = cv2.imdecode(coded, cv2.IMREAD_COLOR).max(axis=2)
+    assert (ringing[~disc] > 3).mean() > 0.005
+    lit = ~dark_surround(ringing)
+    inside_px = cv2.distanceTransform(disc.astype(np.uint8), cv2.DIST_L2, 5)
+    assert not lit[~disc].any() and lit[inside_px > 6].all()
+
+
 def test_text_in_the_surround_is_not_the_lens():
     image, disc = circle_image()
     image[3:6, 2:8] = 255

