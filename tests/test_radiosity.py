@@ -1,5 +1,7 @@
 """Form factors and bounced light against closed forms."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import trimesh
@@ -44,6 +46,21 @@ def test_light_at_the_centre_of_a_sphere_bounces_to_the_geometric_series(sphere,
     bounced = sphere.indirect(light, np.full((sphere.count, 3), albedo))
     series = sum(albedo**k for k in range(1, BOUNCES + 1))
     np.testing.assert_allclose(bounced, series, rtol=0.02)
+
+
+@pytest.mark.parametrize("albedo", [0.3, 0.6])
+def test_half_a_sphere_gets_nearly_the_bounce_of_the_whole_from_what_nobody_saw(hollow_sphere, albedo):
+    """A cos² beam from the centre lights one half only: E = ρ/(1 − ρ)·(mean of E_direct) on the whole sphere."""
+    centre = hollow_sphere.vertices_mm[hollow_sphere.triangles].mean(axis=1)
+    seen = replace(hollow_sphere, triangles=hollow_sphere.triangles[centre[:, 2] > 0])
+    half = Radiosity(seen, Caster(seen), cell_mm=3.0)
+    direct = half.direct([half.lamp(np.eye(4), np.zeros(3), COSINE)], n=2.0, q=2.0)
+    true = albedo / (1 - albedo) * RADIUS_MM**-2.0 / 6
+    bounced = half.indirect(direct, np.full((half.count, 3), albedo))
+    half.unseen = np.zeros_like(half.unseen)
+    without = half.indirect(direct, np.full((half.count, 3), albedo))
+    assert np.mean(bounced) == pytest.approx(true, rel=0.2)
+    assert abs(np.mean(bounced) - true) < abs(np.mean(without) - true) / 2
 
 
 def test_a_lamp_at_the_centre_lights_a_sphere_evenly(sphere):

@@ -38,7 +38,7 @@ def test_a_picture_without_a_surround_is_kept_whole_although_its_corner_pixels_a
 
 
 def test_a_codecs_ringing_beside_the_lens_circle_is_not_the_lens_nor_is_the_circles_halo():
-    image, disc = circle_image(480, 640, 200)
+    _, disc = circle_image(480, 640, 200)
     photo = cv2.GaussianBlur(np.uint8([120, 150, 230]) * np.uint8(disc)[..., None], (0, 0), 0.5)
     coded = cv2.imencode(".jpg", photo, [cv2.IMWRITE_JPEG_QUALITY, 90])[1]
     ringing = cv2.imdecode(coded, cv2.IMREAD_COLOR).max(axis=2)
