@@ -23,8 +23,8 @@ MOST_GUIDES = 3
 SEARCH_PIXELS = 8_000
 """Guides are sought with so many pixels of the probe."""
 
-REFINE_STEPS, SPREAD = 90, 0.2
-POLISH_STEPS, POLISH_SPREAD = 30, 0.05
+REFINE_STEPS, SPREAD = 50, 0.2
+POLISH_STEPS, POLISH_SPREAD = 60, 0.05
 TOLERANCE = 1e-3
 """The search ends when positions move by less than this share of the ring's radius, and the loss by less."""
 
