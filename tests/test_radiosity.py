@@ -50,7 +50,7 @@ def test_light_at_the_centre_of_a_sphere_bounces_to_the_geometric_series(sphere,
 
 @pytest.mark.parametrize("albedo", [0.3, 0.6])
 def test_half_a_sphere_gets_nearly_the_bounce_of_the_whole_from_what_nobody_saw(hollow_sphere, albedo):
-    """A cos² beam from the centre lights one half only: E = ρ/(1 − ρ)·(mean of E_direct) on the whole sphere."""
+    """A cos² beam from the centre lights one half only: E = ρ/(1 − ρ)·(mean of E_direct) on the whole."""
     centre = hollow_sphere.vertices_mm[hollow_sphere.triangles].mean(axis=1)
     seen = replace(hollow_sphere, triangles=hollow_sphere.triangles[centre[:, 2] > 0])
     half = Radiosity(seen, Caster(seen), cell_mm=3.0)

@@ -31,6 +31,7 @@ from endotwin.fit.hashgrid import HashGrid, HashOperator
 from endotwin.fit.lighting import Relighting, lit
 from endotwin.fit.model import Globals, at_pixels
 from endotwin.fit.tilt import tilted
+from endotwin.fit.unexplained import residual_warning
 from endotwin.fit.within import Within
 from endotwin.light.shading import F0_DIELECTRIC, ROUGHNESS_TISSUE
 from endotwin.pixels.length_unit import unit_mm
@@ -142,7 +143,7 @@ def fit_twin(twin: Twin, pace: Pace, seed: int, states: Mapping[str, str], price
         rows = telling[torch.from_numpy(drawn(len(telling), count, np.random.default_rng(seed)))]
         state, cost, coat = _find_light(samples[rows], surface, start, pace, relighting, wanted)
     with stopwatch.stage("detail"):
-        state, normals = _find_detail(samples, twin, state, cost, pace, relighting)
+        state, normals, left = _find_detail(samples, twin, state, cost, pace, relighting)
         twin = replace(twin, surface=replace(surface, normals=normals))
     odd = unusual(state.shared)
     if odd:
@@ -155,6 +156,8 @@ def fit_twin(twin: Twin, pace: Pace, seed: int, states: Mapping[str, str], price
         decisions = {**decided.decisions, "coat": coat}
         if "interreflection" in decided.effects and not relighting.bounces:
             decisions["interreflection"] = _without_bounce(decisions["interreflection"])
+        if left is not None and (said := residual_warning(left, twin.sequence(), decisions)):
+            logger.warning("%s; 'endotwin check %s' looks for the cause", said, twin.source.path)
         fitted = price(_fitted(twin, state, relighting.effects, decisions), caster, samples.views)
     return fitted.with_record(
         fit={"method": "twin", "undetermined": list(start.undetermined), **stopwatch.to_dict()}
@@ -235,9 +238,9 @@ def _find_light(
 
 def _find_detail(
     samples: Samples, twin: Twin, state: State, cost: _Cost, pace: Pace, relighting: Relighting
-) -> tuple[State, np.ndarray]:
-    """The state with finer features on top, and normals [V, 3] tilted as the photos show; light, response
-    and the coarse features stay.
+) -> tuple[State, np.ndarray, float | None]:
+    """The state with finer features on top, normals [V, 3] tilted as the photos show, and what is left of the
+    photos (None without time for detail); light, response and the coarse features stay.
 
     They are as fine as the mesh: finer ones would say nothing that a vertex can hold. Where there is no time
     for hash features, each vertex has a value of its own: those lack only what vertices learn from others.
@@ -251,7 +254,7 @@ def _find_detail(
     setup_s = cost.setup_s * len(surface.vertices_mm) * len(grid.cells_mm) / cost.weights
     left_s = pace.left(ITERATIONS)
     if finest_mm > coarsest_mm or not pace.plan.steps or left_s <= cost.step_s / 2:
-        return state, normals
+        return state, normals, None
     if np.isfinite(left_s):
         assembly_s = ASSEMBLY * (left_s - setup_s if left_s > 2 * setup_s else left_s)
         count = int(cost.pixels * assembly_s / cost.step_s)
@@ -276,7 +279,7 @@ def _find_detail(
             break
         normals = tilted(normals, solver, state, relighting.effects)
         pace.report("tilt the normals", number + 1, pace.plan.tilts)
-    return state, normals
+    return state, normals, solver.noise(state)
 
 
 def _light_grid(unit: float) -> HashGrid:
