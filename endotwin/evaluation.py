@@ -28,7 +28,8 @@ import numpy as np
 from endotwin import metrics, shading
 from endotwin.casting import Correspondences
 from endotwin.errors import TwinError
-from endotwin.output import check_picture, whole_file
+from endotwin.images import write_png
+from endotwin.output import check_picture
 from endotwin.render import Renderer
 from endotwin.sequence import Frame
 from endotwin.surface import Surface
@@ -263,7 +264,7 @@ def evaluate(
             f"{twin.source.path} has no held-out frame to score; fuse a sequence of two or more frames"
         )
     if sheet is not None:
-        _write_sheet(rows, sheet, overwrite)
+        write_png(Path(sheet), np.vstack(rows), overwrite)
     evaluation = Evaluation(tuple(scores), twin.response.gamma, twin.light, twin.source.geometry)
     if evaluation.psnr < POOR_DB:
         logger.warning(
@@ -274,12 +275,13 @@ def evaluate(
 
 
 def _sheet_row(held_out: _HeldOut, score: FrameScore) -> np.ndarray:
-    """Photo, render and error side by side, uint8 [h, 3·SHEET_WIDTH, 3], BGR."""
+    """Photo, render and error side by side, uint8 [h, 3·SHEET_WIDTH, 3], RGB."""
     error = np.abs(held_out.photo - held_out.render).mean(axis=-1) / ERROR_FULL_SCALE * held_out.valid
+    heat = cv2.applyColorMap(_eight_bit(error), cv2.COLORMAP_INFERNO)
     pictures = {
-        f"photo {held_out.frame.name}": cv2.cvtColor(held_out.frame.color, cv2.COLOR_RGB2BGR),
-        f"render, {score.psnr:.1f} dB": cv2.cvtColor(_eight_bit(held_out.render), cv2.COLOR_RGB2BGR),
-        f"error, 0 to {ERROR_FULL_SCALE:g}": cv2.applyColorMap(_eight_bit(error), cv2.COLORMAP_INFERNO),
+        f"photo {held_out.frame.name}": held_out.frame.color,
+        f"render, {score.psnr:.1f} dB": _eight_bit(held_out.render),
+        f"error, 0 to {ERROR_FULL_SCALE:g}": cv2.cvtColor(heat, cv2.COLOR_BGR2RGB),
     }
     return np.hstack([_labelled(picture, label) for label, picture in pictures.items()])
 
@@ -295,8 +297,3 @@ def _labelled(picture: np.ndarray, label: str) -> np.ndarray:
         corner = (6 + offset, height - 8 + offset)
         cv2.putText(small, label, corner, cv2.FONT_HERSHEY_SIMPLEX, 0.42, color, 1, cv2.LINE_AA)
     return small
-
-
-def _write_sheet(rows: list[np.ndarray], path: Path, overwrite: bool) -> None:
-    with whole_file(path, overwrite) as file:
-        file.write_bytes(cv2.imencode(".png", np.vstack(rows))[1].tobytes())

@@ -14,6 +14,7 @@ import numpy as np
 import tifffile
 
 from endotwin.errors import SequenceError
+from endotwin.output import whole_file
 
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 JPEG_SIGNATURE, JPEG_END = b"\xff\xd8", b"\xff\xd9"
@@ -37,6 +38,13 @@ def read_color(path: Path) -> np.ndarray:
     if image is None:
         raise _damaged(path)
     return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+
+
+def write_png(path: Path, image: np.ndarray, overwrite: bool = False) -> None:
+    """Write uint8 [H, W, 3], RGB, as the PNG file ``path``, whole or not at all; raises OutputError."""
+    content = cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))[1].tobytes()
+    with whole_file(path, overwrite) as beside:
+        beside.write_bytes(content)
 
 
 def read_plane(path: Path) -> np.ndarray:

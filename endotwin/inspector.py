@@ -5,13 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pyvista as pv
 from vtkmodules.vtkCommonCore import vtkLogger
 
 from endotwin.cameras import Camera
-from endotwin.errors import EndotwinError, OptionError, OutputError, SequenceError, TrajectoryError
+from endotwin.errors import EndotwinError, OptionError, SequenceError, TrajectoryError
+from endotwin.images import write_png
 from endotwin.output import check_picture, whole_file
 from endotwin.poses import read_poses, write_c3vd_poses
 from endotwin.synth.flight import FlightOptions, fly
@@ -106,9 +106,7 @@ def inspect(
         return
     check_picture(Path(screenshot), overwrite)
     sheet = Stage(twin, maps, off_screen=True).contact_sheet([map] if map else list(maps))
-    with whole_file(Path(screenshot), overwrite) as beside:
-        if not cv2.imwrite(str(beside), sheet[..., ::-1]):
-            raise OutputError(f"{screenshot} cannot be written; is the disk full?")
+    write_png(Path(screenshot), sheet, overwrite)
 
 
 def _has_display() -> bool:

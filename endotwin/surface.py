@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from safetensors.numpy import load_file, save_file
+from safetensors.numpy import load_file, save
 
 
 @dataclass(frozen=True)
@@ -71,11 +71,11 @@ class Surface:
         """The same surface with other coverage [V] each."""
         return replace(self, seen_by=seen_by, best_cosine=best_cosine, nearest_mm=nearest_mm)
 
-    def save(self, path: Path) -> None:
-        """Write all arrays as they are to a ``.safetensors`` file."""
-        save_file({name: np.ascontiguousarray(value) for name, value in vars(self).items()}, path)
+    def to_bytes(self) -> bytes:
+        """All arrays as they are, as the content of a ``.safetensors`` file."""
+        return save({name: np.ascontiguousarray(value) for name, value in vars(self).items()})
 
     @classmethod
     def load(cls, path: Path) -> Surface:
-        """Read what ``save`` wrote."""
+        """Read a file of what ``to_bytes`` gave."""
         return cls(**load_file(path))
