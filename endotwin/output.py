@@ -13,7 +13,7 @@ import os
 import re
 import shutil
 import tempfile
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
@@ -145,6 +145,47 @@ def write_folder(
             _settle(new)
             new.rename(target)
             _settle(target.parent)
+
+
+def move_folder(new: Path, path: Path, own: Callable[[Path], bool]) -> None:
+    """Put the whole folder ``new`` in the place of ``path``, whose files that are not ``own`` go with it.
+
+    Until its last rename ``new`` is whole beside ``path``, and a run that was killed can do the same again.
+
+    Args:
+        own: whether a file of ``path``, by its relative path, is endotwin's to replace.
+
+    Raises:
+        OutputError: a file that is not would be lost; OSError: as the system has it.
+    """
+    path = Path(path).absolute()
+    with _workplace(path.parent) as aside:
+        if path.exists():
+            _adopt(path, new, own)
+            path.rename(aside / path.name)
+        try:
+            new.rename(path)
+        except BaseException:
+            with suppress(OSError):
+                (aside / path.name).rename(path)
+            raise
+
+
+def _adopt(old: Path, new: Path, own: Callable[[Path], bool]) -> None:
+    """Link files of ``old`` that are not ``own`` into ``new``, or copy them where that cannot be."""
+    files = (file for file in old.rglob("*") if file.is_symlink() or not file.is_dir())
+    for file in files:
+        name = file.relative_to(old)
+        target = new / name
+        if own(name) or (target.exists() and target.samefile(file)):
+            continue
+        if target.exists():
+            raise OutputError(f"{file} is not endotwin's to replace; move it to another place")
+        target.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            os.link(file, target, follow_symlinks=False)
+        except OSError:
+            shutil.copy2(file, target, follow_symlinks=False)
 
 
 def _exchange(folder: Path, files: Mapping[str, bytes], mark: str, own: re.Pattern) -> None:

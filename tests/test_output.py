@@ -9,7 +9,7 @@ import pytest
 from faults import full_disk, killed_at_every_operation
 
 from endotwin.errors import OutputError
-from endotwin.output import check_apart, check_free, check_picture, whole_file, write_folder
+from endotwin.output import check_apart, check_free, check_picture, move_folder, whole_file, write_folder
 
 OWN = re.compile("mark|[a-z]-[0-9]")
 
@@ -162,6 +162,56 @@ def test_a_full_disk_is_told_with_the_file_and_the_room_and_changes_nothing(made
         with told, full_disk(made.parent, after), whole_file(made.parent / "file", overwrite=True) as file:
             file.write_text("new")
         assert contents(made.parent) == before
+
+
+def write_texts(folder: Path, **texts: str) -> None:
+    for name, text in texts.items():
+        file = folder / name.replace("_", "/")
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_text(text)
+
+
+def test_a_folder_takes_the_place_of_another_with_the_users_files_wherever_it_is_killed(tmp_path):
+    new, out = tmp_path / "new", tmp_path / "out"
+    guests = {"mine": "1", "notes/mine": "2"}
+
+    def begin() -> None:
+        write_texts(new, a="new", b="new")
+        write_texts(out, a="old", c="old", mine="1", notes_mine="2")
+
+    def work() -> None:
+        move_folder(new, out, lambda name: str(name) in "abc")
+
+    def look() -> None:
+        there = contents(tmp_path)
+        assert set(guests.values()) <= set(there.values())
+        if new.exists():
+            work()
+        assert contents(out) == {"a": "new", "b": "new", **guests}
+        whole_of_another = tmp_path / "sweeps"
+        with whole_file(whole_of_another) as file:
+            file.touch()
+        whole_of_another.unlink()
+        assert list(tmp_path.iterdir()) == [out]
+        begin()
+
+    begin()
+    assert killed_at_every_operation(work, look) >= 5
+
+
+def test_a_users_file_that_would_be_lost_is_named(tmp_path):
+    write_texts(tmp_path / "new", a="new", b="new")
+    write_texts(tmp_path / "out", a="old", b="mine")
+    with pytest.raises(OutputError, match="out/b is not endotwin's to replace"):
+        move_folder(tmp_path / "new", tmp_path / "out", lambda name: str(name) == "a")
+    assert contents(tmp_path / "out") == {"a": "old", "b": "mine"}
+
+
+def test_a_folder_that_cannot_take_its_place_leaves_the_other_there(tmp_path):
+    write_texts(tmp_path / "out", a="old")
+    with pytest.raises(OSError):
+        move_folder(tmp_path / "missing", tmp_path / "out", lambda name: True)
+    assert contents(tmp_path) == {"out/a": "old"}
 
 
 def test_a_failed_overwrite_keeps_what_was_there(made, tmp_path):

@@ -193,6 +193,28 @@ def test_another_command_does_not_go_on_with_an_unfinished_dataset(twin, whole, 
     assert contents(tmp_path / "dataset") == whole
 
 
+def test_a_dataset_that_is_replaced_keeps_what_others_put_into_it(twin, whole, tmp_path):
+    out = tmp_path / "dataset"
+    render(twin, out, seed=1)
+    (out / "0000_extra.tiff").write_bytes(b"endotwin's no more")
+    (out / "splits").mkdir()
+    (out / "splits" / "0001_color.png").write_bytes(b"mine")
+    (out / "0001_depth.tiff").write_bytes(b"broken")
+
+    class Stopped(BaseException):
+        pass
+
+    def stopped(*_) -> None:
+        raise Stopped
+
+    with pytest.MonkeyPatch.context() as patch, pytest.raises(Stopped):
+        patch.setattr(Partial, "remove", stopped)
+        render(twin, out, overwrite=True)
+    render(twin, out, overwrite=True)
+    guests = {"0000_extra.tiff": b"endotwin's no more", "splits/0001_color.png": b"mine"}
+    assert contents(out) == {**whole, **guests}
+
+
 def test_a_folder_of_someone_else_is_not_taken_for_an_unfinished_dataset(twin, tmp_path):
     (tmp_path / "dataset.partial").mkdir()
     (tmp_path / "dataset.partial" / "data").write_text("precious")

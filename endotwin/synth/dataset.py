@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import json
 import logging
 from collections.abc import Callable, Iterator
@@ -15,7 +14,7 @@ import trimesh
 
 from endotwin.cameras import Camera
 from endotwin.errors import EndotwinError, OptionError, OutputError, TwinError
-from endotwin.output import check_apart
+from endotwin.output import DATASET, check_apart, unwritable
 from endotwin.synth import crew
 from endotwin.synth.datasheet import write_datasheet
 from endotwin.synth.job import Job
@@ -192,8 +191,10 @@ def _finish(job: Job, partial: Partial) -> None:
         points = surface.vertices_mm.astype("float64") + surface.origin_mm
         trimesh.Trimesh(points, surface.triangles, process=False).export(folder / "surface.ply")
     document = {**job.document, "coverage": statistics.mean_coverage()}
-    (folder / "dataset.json").write_text(json.dumps(document, indent=1, ensure_ascii=False) + "\n")
     write_datasheet(folder / "datasheet.html", document, statistics)
+    document["files"] = sorted({*partial.kinds(), DATASET})
+    text = json.dumps(document, indent=1, ensure_ascii=False) + "\n"
+    (folder / DATASET).write_text(text, encoding="utf-8", errors="backslashreplace")
     partial.finish()
 
 
@@ -208,7 +209,7 @@ def _doubt_exposure(brightness: np.ndarray) -> None:
 
 
 def _summary(out: Path) -> Summary:
-    document = json.loads((out / "dataset.json").read_text())
+    document = json.loads((out / DATASET).read_text(encoding="utf-8"))
     size = sum(file.stat().st_size for file in out.rglob("*") if file.is_file())
     return Summary(out, document["frames"], size, document["coverage"].get("valid"))
 
@@ -222,19 +223,16 @@ def _resumable(partial: Partial) -> Iterator[None]:
         if not done_shards(partial.path):
             partial.remove()
             if isinstance(error, OSError):
-                raise _out_of_disk(error, partial, "") from error
+                raise _unwritable(error, partial) from error
             raise
         kept = f"what is done is kept in {partial.path}, and the same command goes on from there"
         if isinstance(error, OSError):
-            raise _out_of_disk(error, partial, f"; {kept}") from error
+            raise OutputError(f"{_unwritable(error, partial)}; {kept}") from error
         if isinstance(error, EndotwinError):
             raise type(error)(f"{error}; {kept}") from error
         error.add_note(kept)
         raise
 
 
-def _out_of_disk(error: OSError, partial: Partial, kept: str) -> OutputError:
-    reason = (
-        "the disk is full" if error.errno in (errno.ENOSPC, errno.EDQUOT) else error.strerror or str(error)
-    )
-    return OutputError(f"{error.filename or partial.path} cannot be written: {reason}; make room{kept}")
+def _unwritable(error: OSError, partial: Partial) -> OutputError:
+    return unwritable(Path(error.filename or partial.path), error)

@@ -61,14 +61,16 @@ def render_shard(
         tar.close()
     mark = folder / DONE / f"{number:06d}.json"
     beside = mark.with_suffix(f".{os.getpid()}.part")
-    beside.write_text(json.dumps(statistics.to_dict()))
+    beside.write_text(json.dumps(statistics.to_dict()), encoding="utf-8")
     beside.replace(mark)
 
 
 def done_shards(folder: Path) -> dict[int, Statistics]:
     """What is known of the shards that are done, by number."""
     marks = sorted((folder / DONE).glob("*.json")) if (folder / DONE).is_dir() else []
-    return {int(mark.stem): Statistics.from_dict(json.loads(mark.read_text())) for mark in marks}
+    return {
+        int(mark.stem): Statistics.from_dict(json.loads(mark.read_text(encoding="utf-8"))) for mark in marks
+    }
 
 
 def _write(path: Path, content: bytes) -> None:

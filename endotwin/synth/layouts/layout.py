@@ -71,7 +71,7 @@ def frame_name(job: Job, index: int) -> str:
 
 def write_camera(folder: Path, camera: Camera) -> None:
     """``camera.json``."""
-    (folder / "camera.json").write_text(json.dumps(camera.to_dict(), indent=1) + "\n")
+    (folder / "camera.json").write_text(json.dumps(camera.to_dict(), indent=1) + "\n", encoding="utf-8")
 
 
 def write_lines(path: Path, lines: list[str]) -> None:

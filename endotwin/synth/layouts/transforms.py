@@ -59,7 +59,7 @@ def _tables(folder: Path, job: Job) -> None:
         "integer_depth_scale": DEPTH_SCALE,
         "frames": frames,
     }
-    (folder / "transforms.json").write_text(json.dumps(content, indent=1) + "\n")
+    (folder / "transforms.json").write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
 
 
 LAYOUT = Layout(
