@@ -30,13 +30,7 @@ logging.getLogger("tifffile").addHandler(logging.NullHandler())
 def read_color(path: Path) -> np.ndarray:
     """A photo, uint8 [H, W, 3], RGB. Raises SequenceError where the file is damaged or no image."""
     content = _complete_bytes(path)
-    image = None
-    if _is_tiff(content):
-        image = _decode_tiff(path, content, cv2.IMREAD_COLOR)
-    elif len(content):
-        image = cv2.imdecode(content, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
-    if image is None:
-        raise _damaged(path)
+    image = _decoded(path, content, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
     return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
 
 
@@ -51,15 +45,23 @@ def read_plane(path: Path) -> np.ndarray:
     """A depth file as stored, [H, W]; of several channels, the first. Raises SequenceError where damaged."""
     if path.suffix.lower() == ".npy":
         return _read_npy(path)
-    content = _complete_bytes(path)
-    plane = None
-    if _is_tiff(content):
-        plane = _decode_tiff(path, content, cv2.IMREAD_UNCHANGED)
-    elif len(content):
-        plane = cv2.imdecode(content, cv2.IMREAD_UNCHANGED)
-    if plane is None or not plane.size:
-        raise _damaged(path)
+    plane = _decoded(path, _complete_bytes(path), cv2.IMREAD_UNCHANGED)
     return plane if plane.ndim == 2 else np.ascontiguousarray(plane[..., 0])
+
+
+def _decoded(path: Path, content: np.ndarray, mode: int) -> np.ndarray:
+    """The image in a file's bytes; raises SequenceError where there is none, or one too large to hold."""
+    image = None
+    try:
+        if _is_tiff(content):
+            image = _decode_tiff(path, content, mode)
+        elif len(content):
+            image = cv2.imdecode(content, mode)
+    except (cv2.error, MemoryError) as error:
+        raise SequenceError(f"{path} says that it is larger than any image; copy the file again") from error
+    if image is None or not image.size:
+        raise _damaged(path)
+    return image
 
 
 def _damaged(path: Path) -> SequenceError:

@@ -3,8 +3,10 @@
 import json
 import re
 import shutil
+import struct
 import subprocess
 import sys
+import zlib
 
 import cv2
 import numpy as np
@@ -16,6 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from endotwin.cameras import CALIBRATIONS, Fisheye, Pinhole
 from endotwin.errors import CameraError, OptionError, SequenceError, TrajectoryError
+from endotwin.images import PNG_SIGNATURE
 from endotwin.poses import read_poses, write_c3vd_poses
 from endotwin.readers import FORMATS, open_sequence
 
@@ -534,6 +537,30 @@ def test_a_tiff_that_lost_its_end_prints_nothing_but_the_error(tmp_path, compres
     )
     assert "0000_depth.tiff is truncated" in ran.stdout
     assert ran.stderr == ""
+
+
+def png_that_claims(size: int) -> bytes:
+    """A PNG file of a few bytes whose header says that it is ``size`` pixels wide and high."""
+
+    def chunk(kind: bytes, content: bytes) -> bytes:
+        body = kind + content
+        return struct.pack(">I", len(content)) + body + struct.pack(">I", zlib.crc32(body))
+
+    header = chunk(b"IHDR", struct.pack(">IIBBBBB", size, size, 8, 2, 0, 0, 0))
+    return PNG_SIGNATURE + header + chunk(b"IDAT", zlib.compress(b"0")) + chunk(b"IEND", b"")
+
+
+def test_a_photo_that_claims_to_be_huge_is_refused(tmp_path):
+    folder = write_c3vd(tmp_path / "c3vd")
+    (folder / "0000_color.png").write_bytes(png_that_claims(60_000))
+    with pytest.raises(SequenceError, match=r"0000_color\.png says that it is larger than any image"):
+        open_sequence(folder)
+
+
+@pytest.mark.parametrize("scale", (0.01, 0.1))
+def test_a_scale_that_leaves_too_few_pixels_is_refused(tmp_path, scale):
+    with pytest.raises(OptionError, match=r"A scale of .* leaves .* pixels|leaves nothing"):
+        open_sequence(write_c3vd(tmp_path / "c3vd"), scale=scale)
 
 
 def test_a_truncated_jpeg_is_refused(tmp_path):

@@ -1,6 +1,7 @@
 """A run that stops, is killed or fills the disk goes on, and the finished bytes do not tell."""
 
 import errno
+import gc
 import os
 import subprocess
 import sys
@@ -13,8 +14,10 @@ import pytest
 import tube_twin
 
 from endotwin.errors import OptionError, OutputError
-from endotwin.synth import Trajectory, crew, synthesize
+from endotwin.synth import Trajectory, Variation, crew, make_job, synthesize
+from endotwin.synth.labels import Labeller
 from endotwin.synth.partial import Partial, partial_path
+from endotwin.synth.shard import render_shard
 from endotwin.twin import Twin
 
 FRAMES = 56
@@ -56,9 +59,12 @@ print(kills)
 
 def render(twin: Twin, out: Path | str, **options) -> None:
     """A small dataset of the twin."""
+    synthesize(twin, trajectory(), out, labels=LABELS, **options)
+
+
+def trajectory() -> Trajectory:
     poses = np.stack([tube_twin.pose(s) for s in np.linspace(0.1, 0.9, FRAMES)])
-    trajectory = Trajectory(poses, np.arange(FRAMES) / 30, "along the axis")
-    synthesize(twin, trajectory, out, labels=LABELS, **options)
+    return Trajectory(poses, np.arange(FRAMES) / 30, "along the axis")
 
 
 def contents(folder: Path) -> dict[str, bytes]:
@@ -124,6 +130,33 @@ def test_a_dask_cluster_of_two_workers_gives_the_same_bytes(twin, whole, tmp_pat
     with distributed.LocalCluster(2, threads_per_worker=1, dashboard_address=None) as cluster:
         render(twin, tmp_path / "dataset", scheduler=cluster.scheduler_address)
     assert contents(tmp_path / "dataset") == whole
+
+
+def test_a_cluster_that_is_lost_is_told_and_the_run_goes_on_with_another(twin, whole, tmp_path):
+    distributed = pytest.importorskip("distributed")
+    options = {"threads_per_worker": 1, "dashboard_address": None, "processes": False}
+    with distributed.LocalCluster(1, **options) as cluster:
+        lost = {"scheduler": cluster.scheduler_address, "progress": lambda *_: cluster.close()}
+        with pytest.raises(OutputError, match=r"scheduler .* lost.*the same command goes on"):
+            render(twin, tmp_path / "dataset", **lost)
+    render(twin, tmp_path / "dataset")
+    assert contents(tmp_path / "dataset") == whole
+
+
+def test_a_worker_that_lives_on_makes_no_folder_that_its_run_has_removed(twin, tmp_path):
+    job = make_job(twin, trajectory(), 0, LABELS, "c3vd2", twin.camera, Variation())
+    with pytest.raises(FileNotFoundError):
+        render_shard(job, Labeller(job), tmp_path / "dataset.partial", 0)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("address", ["foo", "tcp://", "nowhere.invalid:8786"])
+def test_an_address_that_makes_no_sense_is_told_in_one_sentence(twin, tmp_path, capfd, address):
+    pytest.importorskip("distributed")
+    with pytest.raises(OptionError, match="no Dask scheduler answers"):
+        render(twin, tmp_path / "dataset", scheduler=address)
+    gc.collect()
+    assert capfd.readouterr().err == "" and list(tmp_path.iterdir()) == []
 
 
 def test_a_scheduler_that_does_not_answer_is_named_and_nothing_is_left(twin, tmp_path, monkeypatch):

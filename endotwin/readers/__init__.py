@@ -14,6 +14,9 @@ __all__ = ["FORMATS", "open_sequence"]
 
 FORMATS: dict[str, ModuleType] = {"c3vd": c3vd, "transforms": transforms, "simcol": simcol, "tum": tum}
 
+LEAST_PX = 8
+"""Height and width below which an image that was made smaller shows nothing."""
+
 
 def open_sequence(path: Path | str, format: str | None = None, scale: float = 1.0) -> Sequence:
     """Open a posed RGB-D sequence.
@@ -46,7 +49,12 @@ def open_sequence(path: Path | str, format: str | None = None, scale: float = 1.
     sequence.check()
     if scale == 1:
         return sequence
-    return replace(sequence, camera=sequence.camera.scaled(scale), scale=scale)
+    camera = sequence.camera.scaled(scale)
+    if min(camera.width, camera.height) < LEAST_PX:
+        raise OptionError(
+            f"A scale of {scale:g} leaves {camera.width}×{camera.height} pixels, too few; choose 0.5, say"
+        )
+    return replace(sequence, camera=camera, scale=scale)
 
 
 def _detected(path: Path) -> ModuleType:

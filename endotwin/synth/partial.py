@@ -15,7 +15,7 @@ from endotwin.errors import OutputError
 from endotwin.output import DATASET, check_free, move_folder, unwritable
 from endotwin.synth.shard import DATA, DONE
 
-JOB, LOCK = "job.json", "lock"
+JOB, LOCK, GOING = "job.json", "lock", "going"
 
 
 class Partial:
@@ -127,11 +127,13 @@ class Partial:
         return self._digest() == digest and self.out.exists() and not self.data.exists()
 
     def _discard(self, name: str) -> None:
-        entry = self.path / name
+        entry, going = self.path / name, self.path / GOING
         if entry.is_dir():
-            shutil.rmtree(entry)
+            shutil.rmtree(going, ignore_errors=True)
+            entry.rename(going)  # at once: a worker of a cluster may live on, and write
         else:
             entry.unlink(missing_ok=True)
+        shutil.rmtree(going, ignore_errors=True)
 
 
 def partial_path(out: Path) -> Path:
