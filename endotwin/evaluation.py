@@ -33,7 +33,7 @@ from endotwin.output import check_picture
 from endotwin.render import Renderer
 from endotwin.sequence import Frame
 from endotwin.surface import Surface
-from endotwin.twin import Light, Twin
+from endotwin.twin import Light, Twin, as_twin
 
 logger = logging.getLogger("endotwin")
 
@@ -238,11 +238,15 @@ def _score(held_out: _HeldOut) -> FrameScore:
 
 
 def evaluate(
-    twin: Twin, sheet: Path | None = None, progress: Progress | None = None, overwrite: bool = False
+    twin: Twin | Path | str,
+    sheet: Path | None = None,
+    progress: Progress | None = None,
+    overwrite: bool = False,
 ) -> Evaluation:
     """Score a fitted twin on the frames that were held out of its fit.
 
     Args:
+        twin: or its folder.
         sheet: PNG file to write a contact sheet to, one row photo | render | error a frame.
         progress: called with (label, done, total).
         overwrite: whether ``sheet`` may exist.
@@ -252,6 +256,7 @@ def evaluate(
         SequenceError: the twin's sequence has moved.
         OutputError: ``sheet`` exists or cannot be written.
     """
+    twin = as_twin(twin)
     if sheet is not None:
         check_picture(sheet, overwrite)
     scores, rows = [], []

@@ -16,7 +16,7 @@ from endotwin.output import check_picture, whole_file
 from endotwin.poses import read_poses, write_c3vd_poses
 from endotwin.synth.flight import FlightOptions, fly
 from endotwin.synth.lumen import Lumen
-from endotwin.twin import Twin
+from endotwin.twin import Twin, as_twin
 
 TILE = (720, 540)
 """Size in pixels, width and height, of one view in a contact sheet; a window is twice as large."""
@@ -74,7 +74,7 @@ def twin_maps(twin: Twin) -> dict[str, Map]:
 
 
 def inspect(
-    twin: Twin,
+    twin: Twin | Path | str,
     screenshot: Path | str | None = None,
     map: str | None = None,
     overwrite: bool = False,
@@ -83,6 +83,7 @@ def inspect(
     """Open a window on ``twin``, or write a contact sheet of its maps without a display.
 
     Args:
+        twin: or its folder.
         screenshot: PNG file to write instead of opening a window.
         map: ``base_color``, ``roughness``, ``metallic``, ``coverage`` or ``normals``: the window's first, the
             sheet's only one. All maps unless given.
@@ -93,15 +94,14 @@ def inspect(
         OptionError: the twin has no such map, or there is no display to open a window on.
         OutputError: ``screenshot`` exists or cannot be written.
     """
+    twin = as_twin(twin)
     maps = twin_maps(twin)
     if map is not None and map not in maps:
         reason = "" if twin.fitted else " (it is not fitted yet)"
         raise OptionError(f"the twin has no map {map!r}{reason}; choose one of {', '.join(maps)}")
     if screenshot is None:
         if not _has_display():
-            raise OptionError(
-                "there is no display to open a window on; write a picture with --screenshot FILE.png"
-            )
+            raise OptionError("there is no display to open a window on; name a PNG file as screenshot")
         Stage(twin, maps, off_screen=False).open_window(map or next(iter(maps)), Path(keyframes))
         return
     check_picture(Path(screenshot), overwrite)

@@ -23,6 +23,7 @@ TWIN, DATASET, TRADEOFF = "twin.json", "dataset.json", "ladder.json"
 """Marks of the folders that endotwin writes."""
 
 HIDDEN = ".endotwin-"
+IN_PYTHON = "in Python overwrite=True"
 
 
 def check_free(path: Path, overwrite: bool, mark: str | None = None) -> None:
@@ -36,7 +37,7 @@ def check_free(path: Path, overwrite: bool, mark: str | None = None) -> None:
     if path.exists():
         _check_own(path, mark)
         if not overwrite:
-            raise OutputError(f"{path} exists already; choose another name or pass --overwrite")
+            raise OutputError(f"{path} exists already; choose another name or pass --overwrite ({IN_PYTHON})")
     places = [path, *path.absolute().parents] if mark else path.absolute().parents
     existing = next(place for place in places if place.exists())
     if not existing.is_dir() or not os.access(existing, os.W_OK):

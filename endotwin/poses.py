@@ -100,6 +100,25 @@ def rigid(matrices: np.ndarray, where: Callable[[int], str]) -> np.ndarray:
     return matrices
 
 
+def as_poses(given: object) -> np.ndarray:
+    """Poses float64 [N, 4, 4] from anything that NumPy reads as matrices [N, 4, 4], or as one [4, 4].
+
+    Raises:
+        TrajectoryError: it does not, or they are not rigid.
+    """
+    try:
+        matrices = np.array(given, np.float64)
+    except (TypeError, ValueError):
+        matrices = np.zeros(0)
+    if matrices.ndim not in (2, 3) or matrices.shape[-2:] != (4, 4) or not matrices.size:
+        shape = getattr(given, "shape", type(given).__name__)
+        raise TrajectoryError(f"poses are matrices [N, 4, 4], camera to world in mm, and not {shape}")
+    try:
+        return rigid(matrices, lambda i: f"pose {i}")
+    except SequenceError as error:
+        raise TrajectoryError(str(error)) from error
+
+
 def from_quaternions(
     positions_mm: np.ndarray, quaternions: np.ndarray, where: Callable[[int], str]
 ) -> np.ndarray:

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -14,24 +15,25 @@ import torch
 from endotwin import shading
 from endotwin.cameras import Camera
 from endotwin.casting import Caster, Correspondences
-from endotwin.errors import TwinError
+from endotwin.errors import OptionError, TwinError
 from endotwin.illumination import Illumination, ViewLight
 from endotwin.incidence import to_camera
+from endotwin.poses import as_poses
 from endotwin.silhouettes import discontinuities
-from endotwin.twin import Twin
+from endotwin.twin import Twin, as_twin
 
 SUBPIXELS = 2
 """A pixel at a silhouette or a shadow's edge is the mean of SUBPIXELS² rays."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Rays:
     """Viewing rays that need no camera: unit ``pixel_directions`` float32 [..., 3] in the camera frame."""
 
     pixel_directions: np.ndarray
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class View:
     """One rendered view and the labels that come with it.
 
@@ -86,18 +88,19 @@ class Renderer:
     """Renders views of one fitted twin through one camera; may be called from several threads.
 
     Args:
-        camera: the twin's own unless given. threads: of the ray casting.
+        twin: or its folder. camera: the twin's own unless given. threads: of the ray casting.
         caster: one of the same surface, to share. exposure: factor on the radiance, one or one a channel.
     """
 
     def __init__(
         self,
-        twin: Twin,
+        twin: Twin | Path | str,
         camera: Camera | None = None,
         threads: int = 2,
         caster: Caster | None = None,
         exposure: Sequence[float] | float = 1.0,
     ):
+        twin = as_twin(twin)
         if not twin.fitted:
             raise TwinError("the twin has no materials yet; run 'endotwin fit' on it first")
         self.twin = twin
@@ -123,8 +126,14 @@ class Renderer:
         Colours of pixels at silhouettes and shadow edges (and of those beside the mask's edge), and only
         those, are means over the pixel's area; labels are of its centre. ``exposure`` is a factor on the
         radiance of this view.
+
+        Raises:
+            TrajectoryError: that is no rigid pose. OptionError: the mask has another shape than the image.
         """
+        (T_world_camera,) = as_poses(T_world_camera)
         shape = (self.camera.height, self.camera.width)
+        if mask is not None and np.shape(mask) != shape:
+            raise OptionError(f"the mask has the shape {np.shape(mask)}, but the image {shape}")
         light = self._illumination.at(T_world_camera)
         hits, normals, radiance, visible = self._cast(self.camera, light, T_world_camera, mask)
         radiance = laid_out(radiance, hits.pixel, shape)

@@ -21,7 +21,7 @@ ISLAND_AREA = 0.01
 DEPTH_SPREAD = 0.02
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Frame:
     """One photo with its depth and pose, in memory.
 
@@ -40,7 +40,7 @@ class Frame:
     T_world_camera: np.ndarray
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Sequence:
     """A posed RGB-D sequence; frames are read when asked for and never kept.
 

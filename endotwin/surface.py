@@ -11,7 +11,7 @@ import numpy as np
 from safetensors.numpy import load_file, save
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Surface:
     """A triangle mesh about a local origin, so that float32 stays exact wherever the world's origin is.
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 import re
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -33,7 +34,7 @@ MAPS = ("base_color", "roughness", "metallic")
 HOLDOUT_EVERY = 8
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Materials:
     """Disney materials of every vertex.
 
@@ -113,7 +114,7 @@ class Source:
         return [training[i] for i in np.linspace(0, len(training) - 1, self.frames).round().astype(int)]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Twin:
     """A surface and, once fitted, its materials, light and response.
 
@@ -254,6 +255,15 @@ class Twin:
             raise TwinError(
                 f"{path} is a damaged twin ({error}); make it again with 'endotwin fuse'"
             ) from error
+
+
+def as_twin(given: Twin | Path | str) -> Twin:
+    """``given`` itself, or the twin in the folder that it names. Raises TwinError where it is neither."""
+    if isinstance(given, Twin):
+        return given
+    if isinstance(given, str | os.PathLike):
+        return Twin.load(Path(given))
+    raise TwinError(f"{type(given).__name__} is no twin; give what fuse_twin or fit_twin made, or its folder")
 
 
 def _checksum(content: bytes) -> str:

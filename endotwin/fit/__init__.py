@@ -39,7 +39,7 @@ def fit(
     if config.method == "twin":
         if epochs is not None:
             raise OptionError(
-                "--epochs belongs to --method endopbr; bound the method twin with --budget SECONDS"
+                "epochs belong to the method endopbr; bound the method twin by a budget of seconds"
             )
         from endotwin.fit.solve import fit_twin
 

@@ -62,7 +62,7 @@ def render_on_cluster(job: Job, folder: Path, shards: Iterable[int], scheduler: 
         from distributed.comm import resolve_address
     except ImportError as error:
         raise OptionError(
-            "--scheduler needs Dask; install it with pip install 'endotwin[cluster]'"
+            "a scheduler needs Dask; install it with pip install 'endotwin[cluster]'"
         ) from error
     try:
         resolve_address(scheduler)

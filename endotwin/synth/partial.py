@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from endotwin.errors import OutputError
-from endotwin.output import DATASET, check_free, move_folder, unwritable
+from endotwin.output import DATASET, IN_PYTHON, check_free, move_folder, unwritable
 from endotwin.synth.shard import DATA, DONE
 
 JOB, LOCK, GOING = "job.json", "lock", "going"
@@ -98,8 +98,7 @@ class Partial:
         if self._digest() is not None and not overwrite:
             raise OutputError(
                 f"{self.path} is an unfinished dataset of another command, twin or version; finish or "
-                f"remove it, or "
-                "pass --overwrite"
+                f"remove it, or pass --overwrite ({IN_PYTHON})"
             )
         for name in (JOB, DATA, DONE):
             self._discard(name)

@@ -59,7 +59,7 @@ def needs(*required: str) -> Callable[[Camera, tuple[str, ...]], str]:
 
     def refusal(camera: Camera, labels: tuple[str, ...]) -> str:
         missing = [label for label in required if label not in labels]
-        return f"this layout needs {' and '.join(missing)}; add it to --labels" if missing else ""
+        return f"this layout needs {' and '.join(missing)}; add it to the labels" if missing else ""
 
     return refusal
 

@@ -27,8 +27,7 @@ def _refusal(camera: Camera, labels: tuple[str, ...]) -> str:
         return needs("rgb")(camera, labels)
     return (
         f"a transforms.json cannot describe this {camera.model} camera; choose another layout, or render "
-        f"through "
-        "a pinhole or fisheye one with --camera"
+        "through a pinhole or fisheye one"
     )
 
 
