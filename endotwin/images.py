@@ -12,7 +12,9 @@ from threading import Lock
 import cv2
 import numpy as np
 import tifffile
+from PIL import Image
 
+from endotwin import floatdepth
 from endotwin.errors import SequenceError
 from endotwin.output import whole_file
 
@@ -21,6 +23,7 @@ JPEG_SIGNATURE, JPEG_END = b"\xff\xd8", b"\xff\xd9"
 TIFF_SIGNATURES = (b"II*\x00", b"MM\x00*", b"II+\x00", b"MM\x00+")
 TIFF_OWN_COMPRESSIONS = (1, 8, 32946)  # none and deflate, which tifffile decodes by itself
 TRAILING_BYTES = 64  # what may follow the end marker of a complete JPEG
+EXIF_ORIENTATION = 0x0112
 OPENCV_LOG = Lock()  # its level is one for the whole process
 
 # A damaged file is told in our own error; without a handler, tifffile's log of it would go to stderr as well.
@@ -43,10 +46,19 @@ def write_png(path: Path, image: np.ndarray, overwrite: bool = False) -> None:
 
 def read_plane(path: Path) -> np.ndarray:
     """A depth file as stored, [H, W]; of several channels, the first. Raises SequenceError where damaged."""
-    if path.suffix.lower() == ".npy":
-        return _read_npy(path)
+    if path.suffix.lower() in floatdepth.SUFFIXES:
+        return floatdepth.read_array(path)
     plane = _decoded(path, _complete_bytes(path), cv2.IMREAD_UNCHANGED)
     return plane if plane.ndim == 2 else np.ascontiguousarray(plane[..., 0])
+
+
+def orientation(path: Path) -> int:
+    """How a photo's EXIF says that it is to be turned, 1 to 8; 1, not at all, where it says nothing."""
+    try:
+        with Image.open(path) as photo:
+            return int(photo.getexif().get(EXIF_ORIENTATION, 1))
+    except (OSError, ValueError, TypeError, SyntaxError, Image.DecompressionBombError):
+        return 1
 
 
 def _decoded(path: Path, content: np.ndarray, mode: int) -> np.ndarray:
@@ -121,15 +133,3 @@ def _decode_tiff(path: Path, content: np.ndarray, mode: int) -> np.ndarray | Non
             return cv2.imdecode(content, mode)
         finally:
             cv2.utils.logging.setLogLevel(level)
-
-
-def _read_npy(path: Path) -> np.ndarray:
-    try:
-        plane = np.squeeze(np.load(path, allow_pickle=False))
-    except Exception as error:  # NumPy parses the header as Python, and raises whatever that does
-        raise SequenceError(f"{path} is truncated or not a NumPy array; copy the file again") from error
-    if plane.ndim != 2:
-        raise SequenceError(f"{path} has the shape {plane.shape}; write it as [height, width]")
-    if plane.dtype.kind not in "uif":
-        raise SequenceError(f"{path} holds {plane.dtype}, which is no depth; write numbers")
-    return plane

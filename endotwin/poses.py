@@ -213,7 +213,7 @@ def numeric_rows(path: Path, columns: int, valid_row: str) -> tuple[np.ndarray, 
 def read_text(path: Path) -> str:
     """The text of a file; raises SequenceError where it cannot be read as text."""
     try:
-        return path.read_text(encoding="utf-8")
+        return path.read_text(encoding="utf-8-sig")
     except FileNotFoundError as error:
         raise SequenceError(f"There is no file {path}; check the path or add the file") from error
     except (OSError, UnicodeDecodeError) as error:

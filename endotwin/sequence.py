@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
@@ -12,13 +13,15 @@ import numpy as np
 
 from endotwin.cameras.base import Camera
 from endotwin.errors import SequenceError
-from endotwin.images import read_color
+from endotwin.images import orientation, read_color
 
 SURROUND_FRAMES = 8
 SURROUND_LEVEL = 3  # of 255, the brightest that noise makes a black pixel
 SURROUND_AREA = 0.002  # of the image, the least that counts as a surround
 ISLAND_AREA = 0.01
 DEPTH_SPREAD = 0.02
+
+logger = logging.getLogger("endotwin")
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,6 +93,12 @@ class Sequence:
                 "add or remove poses until there is one a frame"
             )
         self._native_color(0)
+        if (turned := orientation(self.color_files[0])) != 1:
+            logger.warning(
+                "%s is marked as turned (EXIF orientation %d), which is not heeded: camera, pose and depth "
+                "belong to the pixels as they are stored",
+                *(self.color_files[0], turned),
+            )
 
     def color(self, index: int) -> np.ndarray:
         """Photo ``index``, uint8 [H, W, 3], RGB."""

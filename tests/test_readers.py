@@ -1,5 +1,6 @@
 """Readers, on files that plain NumPy, Pillow and tifffile wrote here, and on every kind of bad input."""
 
+import codecs
 import json
 import re
 import shutil
@@ -489,8 +490,29 @@ def test_photos_are_not_enlarged(tmp_path):
 
 def test_depth_that_is_not_16_bit(tmp_path):
     folder = write_c3vd(tmp_path / "c3vd")
-    tifffile.imwrite(folder / "0000_depth.tiff", np.ones((H, W), np.float32))
+    tifffile.imwrite(folder / "0000_depth.tiff", np.ones((H, W), np.uint8))
     refused(folder, "0000_depth.tiff", "16 bit")
+
+
+def test_a_byte_order_mark_is_no_part_of_a_file(tmp_path):
+    folder = write_c3vd(tmp_path / "c3vd")
+    before = open_sequence(folder)
+    for name in ("pose.txt", "camera.json"):
+        (folder / name).write_bytes(codecs.BOM_UTF8 + (folder / name).read_bytes())
+    after = open_sequence(folder)
+    np.testing.assert_array_equal(after.T_world_camera, before.T_world_camera)
+    assert after.camera == before.camera
+
+
+def test_photos_that_are_marked_as_turned_are_read_as_stored_with_a_warning(tmp_path, caplog):
+    folder = write_c3vd(tmp_path / "c3vd")
+    stored = open_sequence(folder).color(0)
+    assert "turned" not in caplog.text
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    Image.fromarray(stored).save(folder / "0000_color.png", exif=exif)
+    np.testing.assert_array_equal(open_sequence(folder).color(0), stored)
+    assert "0000_color.png is marked as turned (EXIF orientation 6)" in caplog.text
 
 
 @pytest.mark.parametrize("kept", [0, 10, 0.5, 0.9, -20, -5, -1])

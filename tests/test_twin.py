@@ -244,3 +244,19 @@ def test_a_single_frame_is_fitted():
 def test_the_source_survives_a_round_trip_through_a_dictionary():
     source = Source("sequence", "tum", 0.5, "heldout", 4)
     assert Source(**json.loads(json.dumps(asdict(source)))) == source
+
+
+@pytest.mark.parametrize(
+    ("spoil", "says"),
+    [
+        (lambda surface: replace(surface, triangles=surface.triangles[:0]), "its surface is empty"),
+        (
+            lambda surface: replace(surface, vertices_mm=surface.vertices_mm * np.float32(1e30)),
+            r"its surface is .*e\+31 mm large",
+        ),
+    ],
+)
+def test_a_mesh_that_is_none_is_told_and_not_blamed_on_the_sequence(twin, tmp_path, spoil, says):
+    replace(twin, surface=spoil(twin.surface)).save(tmp_path / "twin")
+    with pytest.raises(TwinError, match=says):
+        Twin.load(tmp_path / "twin")

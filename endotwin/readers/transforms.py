@@ -3,9 +3,9 @@
 Unit: positions are metres, as nerfstudio has it, unless the file says ``"unit": "mm"``; depth in that
 unit is the stored value times ``depth_unit_scale_factor`` (0.001 unless given: 16-bit millimetres beside
 positions in metres), or times instant-ngp's ``integer_depth_scale``. Depth is z-depth, 0 for none; PNG,
-TIFF and NPY are read. A frame's depth map is its ``depth_file_path`` (instant-ngp: ``depth_path``), or
-else ``depth/NAME.*`` beside the photo's folder, or ``NAME_depth.*`` beside the photo. Principal points
-count from the image's edge, so half a pixel is subtracted.
+TIFF, NPY, NPZ and OpenEXR are read. A frame's depth map is its ``depth_file_path`` (instant-ngp:
+``depth_path``), or else ``depth/NAME.*`` beside the photo's folder, or ``NAME_depth.*`` beside the photo.
+Principal points count from the image's edge, so half a pixel is subtracted.
 """
 
 from __future__ import annotations
@@ -18,13 +18,14 @@ import numpy as np
 
 from endotwin.cameras import Camera, camera_from_dict
 from endotwin.errors import CameraError, SequenceError
+from endotwin.floatdepth import SUFFIXES, in_mm
 from endotwin.images import read_color, read_plane
 from endotwin.poses import frame_times, read_json, read_transforms_poses, transforms_unit_mm
 from endotwin.sequence import Sequence
 
 MARK = "transforms.json"
 COLOR_SUFFIXES = (".png", ".jpg", ".jpeg", ".tiff", ".tif")
-DEPTH_SUFFIXES = (".png", ".tiff", ".tif", ".npy")
+DEPTH_SUFFIXES = (".png", ".tiff", ".tif", *SUFFIXES)
 PINHOLES = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV")
 FISHEYE = "OPENCV_FISHEYE"
 INTRINSICS = (
@@ -75,9 +76,7 @@ def read_depth_mm(path: Path, level_mm: float) -> np.ndarray:
     raw = read_plane(path)
     if raw.dtype == np.uint8:
         raise SequenceError(f"{path} holds 8 bit, too coarse for depth; write 16-bit PNG or floating point")
-    depth_mm = raw.astype(np.float32) * np.float32(level_mm)
-    depth_mm[~(np.isfinite(depth_mm) & (depth_mm > 0))] = np.nan
-    return depth_mm
+    return in_mm(raw, level_mm)
 
 
 def _color_file(file: Path, frame: dict) -> Path:

@@ -138,7 +138,8 @@ ENCODINGS: dict[str, Encoding] = {
     "rgb": Encoding(
         ".png",
         lambda color: png(encode_color(color)),
-        "8-bit RGB, after the camera response; black where no surface is seen",
+        "8-bit RGB, after the camera response; black where no surface is seen, save in gaps of a pixel or "
+        "two within the surface, which take its colour: their depth is 0",
     ),
     "rgb_linear": Encoding(
         ".png",
