@@ -166,7 +166,7 @@ def covered_pixels(hits: Correspondences, surface: Surface, shape: tuple[int, in
 
 
 def gain_of(photo: np.ndarray, radiance: np.ndarray, gamma: float) -> float:
-    """Factor on ``radiance`` [H, W, 3] that makes it look like ``photo`` (display-encoded, of its shape).
+    """Factor on ``radiance`` [..., 3] that makes it look like ``photo`` (display-encoded, of its shape).
 
     The median of their ratio over mid-tones, which highlights and shadows' edges do not move; 1 where there
     are none.
@@ -207,10 +207,10 @@ def _held_out(twin: Twin, progress: Progress | None) -> Iterator[_HeldOut]:
             logger.warning("Held-out frame %s has no valid pixel and is not scored.", frame.name)
             continue
         photo = frame.color.astype(np.float32) / 255
-        view, gain = renderer.view(frame.T_world_camera, valid), 1.0
+        view, gain = renderer.view(frame.T_world_camera, sequence.lens_mask), 1.0
         if "gain" in twin.effects:
-            gain = gain_of(photo, view.radiance, twin.response.gamma)
-            view = renderer.view(frame.T_world_camera, valid, gain)
+            gain = gain_of(photo[valid], view.radiance[valid], twin.response.gamma)
+            view = renderer.view(frame.T_world_camera, sequence.lens_mask, gain)
         covered = covered_pixels(view.hits, twin.surface, valid.shape)
         yield _HeldOut(frame, photo, view.color, gain, valid, covered)
     if progress:
