@@ -17,6 +17,7 @@ from endotwin.errors import EndotwinError, OptionError, OutputError, TwinError
 from endotwin.output import DATASET, check_apart, unwritable
 from endotwin.synth import crew
 from endotwin.synth.datasheet import write_datasheet
+from endotwin.synth.encodings import FLOW_RANGE_PX
 from endotwin.synth.job import Job
 from endotwin.synth.labels import DEFAULT_LABELS, LABELS
 from endotwin.synth.layouts import LAYOUTS
@@ -43,19 +44,20 @@ class Summary:
     Attributes:
         path: the dataset's folder. frames: how many. bytes: size of all of its files.
         valid: share of the pixels that show surface which the training photos show, over all frames; None
-        where
-            no mask was asked for.
+            where no mask was asked for.
+        advice: what another program must be told to read it; empty where there is nothing.
     """
 
     path: Path
     frames: int
     bytes: int
     valid: float | None
+    advice: str = ""
 
     def __str__(self) -> str:
         size = f"{self.bytes / 1e6:.1f} MB"
         valid = "" if self.valid is None else f", {self.valid:.1%} of the pixels valid"
-        return f"{self.path}: {self.frames} frames, {size}{valid}"
+        return f"{self.path}: {self.frames} frames, {size}{valid}{self.advice and f'; {self.advice}'}"
 
 
 def synthesize(
@@ -138,7 +140,7 @@ def make_job(
         draws=variation.draw(len(trajectory), seed),
         regions=variation.regions,
         labels=labels,
-        images=tuple(image for label in labels for image in LABELS[label]),
+        images=tuple(dict.fromkeys(image for label in labels for image in LABELS[label])),
         layout=layout,
         shard_frames=LAYOUTS[layout].shard_frames,
         document=describe(twin, trajectory, seed, labels, layout, camera, variation),
@@ -180,6 +182,7 @@ def _finish(job: Job, partial: Partial) -> None:
     """Write what belongs to all frames, and put the dataset in its place."""
     statistics = total(list(done_shards(partial.path).values()))
     _doubt_exposure(statistics.brightness)
+    _doubt_flow(statistics.flow)
     folder = partial.data
     layout = LAYOUTS[job.layout]
     layout.tables(folder, job)
@@ -208,10 +211,21 @@ def _doubt_exposure(brightness: np.ndarray) -> None:
             )
 
 
+def _doubt_flow(counts: dict[str, list[int]]) -> None:
+    """Warn where flow is beyond what C3VD's code can say, with the share that is lost."""
+    for name, (flowing, lost) in counts.items():
+        if lost:
+            logger.warning(
+                "%.1f %% of the %s is beyond the ±%g px of its code and lost; ask for %s_exr or %s_npz too",
+                *(100 * lost / flowing, name, FLOW_RANGE_PX, name, name),
+            )
+
+
 def _summary(out: Path) -> Summary:
     document = json.loads((out / DATASET).read_text(encoding="utf-8"))
     size = sum(file.stat().st_size for file in out.rglob("*") if file.is_file())
-    return Summary(out, document["frames"], size, document["coverage"].get("valid"))
+    advice = LAYOUTS[document["format"]].advice
+    return Summary(out, document["frames"], size, document["coverage"].get("valid"), advice)
 
 
 @contextmanager

@@ -32,6 +32,7 @@ class Layout:
         refusal: why a camera or a choice of labels does not fit, as a sentence; empty where it does.
         packed: whether a shard is one tar file.
         reads: whether endotwin reads it back. root: the folder within the dataset that it reads.
+        advice: what another program must be told to read it.
     """
 
     name: str
@@ -44,6 +45,7 @@ class Layout:
     shard_frames: int = FOLDER_SHARD
     reads: bool = True
     root: str = "."
+    advice: str = ""
 
     def encoding(self, image: str) -> Encoding:
         """How ``image`` is written."""
