@@ -22,6 +22,7 @@ PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 JPEG_SIGNATURE, JPEG_END = b"\xff\xd8", b"\xff\xd9"
 TIFF_SIGNATURES = (b"II*\x00", b"MM\x00*", b"II+\x00", b"MM\x00+")
 TIFF_OWN_COMPRESSIONS = (1, 8, 32946)  # none and deflate, which tifffile decodes by itself
+LARGEST_PIXELS = 1 << 30  # that OpenCV decodes
 TRAILING_BYTES = 64  # what may follow the end marker of a complete JPEG
 EXIF_ORIENTATION = 0x0112
 OPENCV_LOG = Lock()  # its level is one for the whole process
@@ -70,7 +71,7 @@ def _decoded(path: Path, content: np.ndarray, mode: int) -> np.ndarray:
         elif len(content):
             image = cv2.imdecode(content, mode)
     except (cv2.error, MemoryError) as error:
-        raise SequenceError(f"{path} says that it is larger than any image; copy the file again") from error
+        raise _endless(path) from error
     if image is None or not image.size:
         raise _damaged(path)
     return image
@@ -80,14 +81,21 @@ def _damaged(path: Path) -> SequenceError:
     return SequenceError(f"{path} is truncated or not an image; copy or download the file again")
 
 
+def _endless(path: Path) -> SequenceError:
+    return SequenceError(f"{path} says that it is larger than any image, or empty; copy the file again")
+
+
 def _complete_bytes(path: Path) -> np.ndarray:
     """The file's bytes, uint8 [N], once its end marker shows that none are missing."""
     try:
         content = path.read_bytes()
     except OSError as error:
         raise SequenceError(f"{path} cannot be read ({error.strerror}); check the file") from error
-    if content.startswith(PNG_SIGNATURE) and not _png_is_whole(content):
-        raise _damaged(path)
+    if content.startswith(PNG_SIGNATURE):
+        if not _png_is_whole(content):
+            raise _damaged(path)
+        if not 0 < _png_pixels(content) <= LARGEST_PIXELS:
+            raise _endless(path)
     if content.startswith(JPEG_SIGNATURE) and JPEG_END not in content[-TRAILING_BYTES:]:
         raise _damaged(path)
     return np.frombuffer(content, np.uint8)
@@ -108,6 +116,12 @@ def _png_is_whole(content: bytes) -> bool:
             return True
         position = end + 4
     return False
+
+
+def _png_pixels(content: bytes) -> int:
+    """How many pixels a whole PNG file says that it has: libpng would print that they are too many."""
+    width, height = struct.unpack_from(">II", content, len(PNG_SIGNATURE) + 8)
+    return width * height
 
 
 def _is_tiff(content: np.ndarray) -> bool:

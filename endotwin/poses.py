@@ -183,7 +183,7 @@ def read_transforms_poses(path: Path) -> tuple[np.ndarray, list[dict]]:
 def transforms_unit_mm(content: dict, path: Path) -> float:
     """Millimetres in the unit of the ``content`` of the ``transforms.json`` at ``path``."""
     unit = content.get("unit", "m")
-    if unit not in MM_PER_UNIT:
+    if not isinstance(unit, str) or unit not in MM_PER_UNIT:
         raise SequenceError(f"{path} has the unit {unit!r}; set 'unit' to one of {', '.join(MM_PER_UNIT)}")
     return MM_PER_UNIT[unit]
 

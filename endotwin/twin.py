@@ -28,6 +28,7 @@ VERSION = 2
 OWN = re.compile(r"twin\.json|effects\.json|(surface|materials)(-[0-9a-f]{16})?\.safetensors")
 """Files of a twin of any version. Arrays lie in files that are named by their own checksum; ``twin.json``
 says which of them are the twin's, so that its rename replaces all of them at once."""
+PARTS = ("camera", "source", "materials", "light", "response", "record")
 UNSEALED = ("source", "record", "seal")
 """Parts of ``twin.json`` that its checksum leaves out: a rendering does not depend on them."""
 MAPS = ("base_color", "roughness", "metallic")
@@ -229,6 +230,7 @@ class Twin:
         path = Path(path)
         document = _read_document(path)
         try:
+            _check_document(document)
             files = _checked_files(path, document)
             constants = document["materials"]
             twin = cls(
@@ -242,8 +244,6 @@ class Twin:
                 effects=Effects.from_dict(document.get("effects", {})),
                 decisions=_read_decisions(path, document),
             )
-            if document["version"] > 1 and document["seal"] != _seal(document):
-                raise ValueError(f"{TWIN} does not match its checksum")
             return require_sound(twin)
         except FileNotFoundError as error:
             if _read_document(path) != document:  # another run replaced the twin just now
@@ -275,6 +275,14 @@ def _seal(document: dict) -> str:
     """SHA-256 of all in ``twin.json`` that a rendering depends on."""
     sealed = {part: value for part, value in document.items() if part not in UNSEALED}
     return hashlib.sha256(json.dumps(sealed, sort_keys=True).encode()).hexdigest()
+
+
+def _check_document(document: dict) -> None:
+    """Raise KeyError where a part is missing, and ValueError where they do not match their checksum."""
+    for part in PARTS:
+        document[part]
+    if document["version"] > 1 and document["seal"] != _seal(document):
+        raise ValueError(f"{TWIN} does not match its checksum")
 
 
 def _checked_files(path: Path, document: dict) -> dict[str, Path]:
