@@ -6,8 +6,9 @@ import pytest
 
 import endotwin
 
+pytestmark = pytest.mark.slow
 
-@pytest.mark.slow
+
 def test_no_dots_remain_along_rims_in_the_held_out_renders_of_the_example(example):
     twin = endotwin.fit_twin(endotwin.fuse_twin(example))
     sequence, renderer = twin.sequence(), endotwin.Renderer(twin)

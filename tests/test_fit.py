@@ -19,6 +19,8 @@ from endotwin.fit.pace import Pace
 from endotwin.fit.samples import gather
 from endotwin.fit.solve import median_edge_mm, proxies
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module", autouse=True)
 def one_thread():
@@ -190,7 +192,7 @@ def test_photos_that_show_nothing_of_the_surface_are_an_error(tube, tmp_path):
     "options, message",
     [
         ({"config": FitConfig(method="nerf")}, "unknown method 'nerf'.*twin, endopbr"),
-        ({"epochs": 3}, "--epochs belongs to --method endopbr"),
+        ({"epochs": 3}, "epochs belong to the method endopbr"),
     ],
 )
 def test_options_that_make_no_sense_are_refused(tube, options, message):

@@ -10,6 +10,8 @@ from faults import full_disk
 
 import endotwin
 
+pytestmark = pytest.mark.slow
+
 COMMANDS = {
     "fuse": ("new", "fuse tube -o new"),
     "fuse over a twin": ("twin", "fuse tube -o twin --overwrite"),

@@ -12,6 +12,8 @@ from command_line import invoke
 
 import endotwin
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory) -> Path:

@@ -20,6 +20,8 @@ from endotwin.synth.partial import Partial, partial_path
 from endotwin.synth.shard import render_shard
 from endotwin.twin import Twin
 
+pytestmark = pytest.mark.slow
+
 FRAMES = 56
 LABELS = ("rgb", "depth", "mask", "flow")
 

@@ -11,6 +11,8 @@ import psutil
 import pytest
 import tube_twin
 
+pytestmark = pytest.mark.slow
+
 PATIENT_S = 60
 
 BEGUN = """

@@ -22,6 +22,8 @@ from endotwin.hashgrid import HashOperator
 from endotwin.incidence import incidence, unit
 from endotwin.render import Renderer
 
+pytestmark = pytest.mark.slow
+
 DISTURBED_DEG = 1.0
 
 

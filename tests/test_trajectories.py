@@ -18,6 +18,8 @@ from endotwin.synth.lumen import Lumen
 from endotwin.synth.screening import Gate, Limits
 from endotwin.synth.trajectories import Trajectory
 
+pytestmark = pytest.mark.slow
+
 AXIS_MM = tube_twin.BEND_MM * tube_twin.SWEEP
 
 

@@ -19,6 +19,8 @@ from endotwin.config import load_config
 from endotwin.errors import EndotwinError, OptionError, TwinError
 from endotwin.synth import Variation, read_variation
 
+pytestmark = pytest.mark.slow
+
 FEW = settings(max_examples=60, deadline=None, suppress_health_check=list(HealthCheck), derandomize=True)
 FEWER = settings(FEW, max_examples=10)
 WORDS = [

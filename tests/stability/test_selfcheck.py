@@ -11,6 +11,8 @@ from endotwin.cli.main import app
 from endotwin import selfcheck
 from endotwin.selfcheck import GROUPS, Finding, run_checks
 
+pytestmark = pytest.mark.slow
+
 CHECKS = [(name, check) for name in GROUPS for check in import_module(f"endotwin.selfcheck.{name}").CHECKS]
 
 
