@@ -414,6 +414,25 @@ def test_a_twin_is_scored_and_fitted_from_where_one_stands_and_keeps_its_guests(
         assert len(list(Path(".").glob("materials-*"))) == 1
 
 
+def test_names_of_effects_are_whole_on_a_narrow_terminal(endotwin, made, monkeypatch):
+    from endotwin.effects import NAMES
+    from endotwin.twin import Twin
+
+    monkeypatch.setenv("COLUMNS", "80")
+    code, out, _ = endotwin("effects", made / "twin")
+    decided = Twin.load(made / "twin").decisions
+    assert code == 0 and len(decided) > 5
+    assert {line.split()[0] for line in out.splitlines() if line.split()} >= set(decided) & set(NAMES)
+    assert max(map(len, out.splitlines())) <= 80
+
+
+def test_no_label_is_no_choice_of_labels(fails, made, tmp_path):
+    trajectory = ["--trajectory", "jitter:frames=1"]
+    assert "no label ''" in fails(
+        "synth", made / "twin", *trajectory, "--labels", "", "-o", tmp_path / "dataset"
+    )
+
+
 def test_the_scores_of_a_twin_that_was_replaced_meanwhile_are_not_kept(endotwin, made, tmp_path, monkeypatch):
     from endotwin import evaluation
     from endotwin.twin import Twin
