@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import errno
 import fcntl
+import filecmp
 import os
 import re
 import shutil
@@ -178,15 +179,19 @@ def _adopt(old: Path, new: Path, own: Callable[[Path], bool]) -> None:
     for file in files:
         name = file.relative_to(old)
         target = new / name
-        if own(name) or (target.exists() and target.samefile(file)):
+        if own(name):
             continue
         if target.exists():
+            if target.samefile(file) or filecmp.cmp(target, file, shallow=False):
+                continue  # a run that was killed came so far
             raise OutputError(f"{file} is not endotwin's to replace; move it to another place")
         target.parent.mkdir(parents=True, exist_ok=True)
         try:
             os.link(file, target, follow_symlinks=False)
         except OSError:
-            shutil.copy2(file, target, follow_symlinks=False)
+            part = target.with_name(f"{HIDDEN}{target.name}")
+            shutil.copy2(file, part, follow_symlinks=False)
+            part.replace(target)
 
 
 def _exchange(folder: Path, files: Mapping[str, bytes], mark: str, own: re.Pattern) -> None:

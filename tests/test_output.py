@@ -1,5 +1,6 @@
 """Outputs appear whole or not at all."""
 
+import errno
 import os
 import re
 import stat
@@ -171,7 +172,15 @@ def write_texts(folder: Path, **texts: str) -> None:
         file.write_text(text)
 
 
-def test_a_folder_takes_the_place_of_another_with_the_users_files_wherever_it_is_killed(tmp_path):
+@pytest.mark.parametrize("links", [True, False])
+def test_a_folder_takes_the_place_of_another_with_the_users_files_wherever_it_is_killed(
+    tmp_path, monkeypatch, links
+):
+    def no_link(*_, **__) -> None:
+        raise OSError(errno.EPERM, "this file system has no links")
+
+    if not links:
+        monkeypatch.setattr(os, "link", no_link)
     new, out = tmp_path / "new", tmp_path / "out"
     guests = {"mine": "1", "notes/mine": "2"}
 
