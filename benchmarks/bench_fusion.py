@@ -9,14 +9,14 @@ from pathlib import Path
 
 import numpy as np
 
-from endotwin.casting import Caster
 from endotwin.fusion import fuse
 from endotwin.fusion.agreement import Tolerance, agreement
 from endotwin.fusion.tsdf import fuse_tsdf
 from endotwin.fusion.views import read_views
-from endotwin.readers import open_sequence
 from endotwin.sequence import Sequence
+from endotwin.sequence.readers import open_sequence
 from endotwin.surface import Surface
+from endotwin.surface.casting import Caster
 
 VOXEL_MM = 0.5
 CAST_BATCHES, CAST_BATCH = 16, 4

@@ -20,7 +20,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from endotwin.evaluation import covered_pixels
+from endotwin.evaluation.evaluation import covered_pixels
 from endotwin.fusion._open3d import o3d
 from endotwin.render import Renderer
 from endotwin.twin import Twin

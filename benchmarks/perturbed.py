@@ -20,9 +20,9 @@ import tifffile
 from scipy.spatial.transform import Rotation
 
 import endotwin
-from endotwin.poses import write_c3vd_poses
-from endotwin.readers.c3vd import DEPTH_RANGE_MM
 from endotwin.sequence import Sequence
+from endotwin.sequence.poses import write_c3vd_poses
+from endotwin.sequence.readers.c3vd import DEPTH_RANGE_MM
 
 FOCAL = {"fx", "fy", "a0"}
 

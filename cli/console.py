@@ -14,8 +14,8 @@ from typing import Annotated
 import typer
 
 from endotwin.errors import OutputError
-from endotwin.output import check_free, whole_file
-from endotwin.stopwatch import Stopwatch
+from endotwin.run.output import check_free, whole_file
+from endotwin.run.stopwatch import Stopwatch
 
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace what is there already.")]
 Profile = Annotated[

@@ -11,7 +11,7 @@ import typer
 from endotwin.cli import console
 
 from endotwin.errors import OutputError
-from endotwin.output import TWIN, check_free, check_picture
+from endotwin.run.output import TWIN, check_free, check_picture
 
 if TYPE_CHECKING:
     from endotwin.twin import Twin

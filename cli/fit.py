@@ -11,7 +11,7 @@ from endotwin.cli import console
 from endotwin.config import DEFAULT, load_config, seconds
 from endotwin.effects import parse_states
 from endotwin.errors import OutputError
-from endotwin.output import TWIN, check_free
+from endotwin.run.output import TWIN, check_free
 
 AROUND = 0.5
 """Python's start before the stopwatch's and its end after it, in shares of the time that the imports took."""

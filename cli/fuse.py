@@ -9,7 +9,7 @@ import typer
 from endotwin.cli import console
 
 from endotwin.config import DEFAULT, load_config
-from endotwin.output import TWIN, check_free
+from endotwin.run.output import TWIN, check_free
 
 
 def fuse(

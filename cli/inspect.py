@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 from endotwin.cli import console
 
-from endotwin.output import check_picture
+from endotwin.run.output import check_picture
 
 
 def inspect(
@@ -42,7 +42,7 @@ def inspect(
         check_picture(screenshot, overwrite)
     with console.command("inspect", profile) as run:
         with run.stage("import"):
-            from endotwin.inspector import inspect
+            from endotwin.look.inspector import inspect
             from endotwin.twin import Twin
         with run.stage("load"):
             twin = Twin.load(twin_folder)

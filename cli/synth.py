@@ -10,7 +10,7 @@ from endotwin.cli import console
 
 from endotwin.effects import parse_states
 from endotwin.errors import OptionError
-from endotwin.output import DATASET, check_apart, check_free, check_picture
+from endotwin.run.output import DATASET, check_apart, check_free, check_picture
 
 LABELS = "rgb, rgb_linear, rgb_exr, depth, depth_exr, normals, mask, albedo, roughness, metallic, diffuse, "
 LABELS += (

@@ -9,7 +9,7 @@ import typer
 from endotwin.cli import console
 
 from endotwin.errors import OptionError
-from endotwin.output import TRADEOFF, check_apart, check_free
+from endotwin.run.output import TRADEOFF, check_apart, check_free
 
 
 def tradeoff(

@@ -11,7 +11,7 @@ from endotwin.selfcheck import run_checks
 from endotwin.selfcheck.finding import shown
 from endotwin.synth import LABELS, LAYOUTS
 from endotwin.synth.encodings import ENCODINGS
-from endotwin.synth.record import COMMON_WORDS
+from endotwin.synth.run.record import COMMON_WORDS
 
 HERE = Path(__file__).parent
 

@@ -20,8 +20,8 @@ _HOME = {
     "evaluate": "evaluation",
     "fit_twin": "pipeline",
     "fuse_twin": "pipeline",
-    "inspect": "inspector",
-    "open_sequence": "readers",
+    "inspect": "look.inspector",
+    "open_sequence": "sequence.readers",
     "synthesize": "pipeline",
 }
 

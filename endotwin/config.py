@@ -11,7 +11,7 @@ import yaml
 
 from endotwin.effects import NAMES, STATES
 from endotwin.errors import OptionError
-from endotwin.yamltext import parsed
+from endotwin.run.yamltext import parsed
 
 METHODS = ("twin", "endopbr")
 SUFFIXES = (".yaml", ".yml")

@@ -13,8 +13,9 @@ from endotwin.cameras import read_camera
 from endotwin.config import STANDARD, FitConfig, FuseConfig
 from endotwin.errors import OptionError, SequenceError
 from endotwin.fit import fit
-from endotwin.readers import open_sequence
-from endotwin.stopwatch import Stopwatch
+from endotwin.render.price import priced
+from endotwin.run.stopwatch import Stopwatch
+from endotwin.sequence.readers import open_sequence
 from endotwin.twin import Source, Twin, as_twin
 
 if TYPE_CHECKING:
@@ -121,7 +122,7 @@ def fit_twin(
             _check_positive(name, value)
     twin = as_twin(twin)
     config = replace(config, method=method or config.method, budget=budget_s or config.budget)
-    return fit(twin, config, epochs, seed, progress, checkpoint, effects)
+    return fit(twin, config, epochs, seed, progress, checkpoint, effects, priced)
 
 
 def synthesize(
@@ -193,7 +194,7 @@ def preview(
     Arguments and errors are those of ``synthesize``; ``out`` is a PNG file. Returns what was written, in a
     line.
     """
-    from endotwin.synth import preview as draw
+    from endotwin.look import preview as draw
 
     job = _job(twin, trajectory, material, light, vary, camera, effects, "rgb", "c3vd", limits, seed)
     return draw.preview(job, out, overwrite)

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 import scenes
 
-from endotwin.casting import Caster
 from endotwin.fusion._open3d import o3c, o3d
 from endotwin.surface import Surface
+from endotwin.surface.casting import Caster
 
 
 def sphere_surface(radius_mm: float = 15.0, centre_mm: float = 0.0) -> Surface:

@@ -22,7 +22,7 @@ from endotwin.check.stream import sharpness_of
 from endotwin.check.views import read_views
 from endotwin.check.warp import disagreement
 from endotwin.errors import SequenceError
-from endotwin.readers import open_sequence
+from endotwin.sequence.readers import open_sequence
 
 pytestmark = pytest.mark.slow
 

@@ -108,7 +108,7 @@ def test_a_sequence_becomes_a_twin_scores_a_dataset_and_a_picture(endotwin, made
 def test_eval_keeps_the_scores_in_the_twin_and_says_that_lpips_is_missing(
     endotwin, made, tmp_path, monkeypatch
 ):
-    from endotwin import metrics
+    from endotwin.evaluation import metrics
     from endotwin.twin import Twin
 
     monkeypatch.setattr(metrics, "_lpips_network", lambda: None)
@@ -510,6 +510,8 @@ def test_an_unfitted_twin_has_no_scores_and_no_dataset(fails, endotwin, made, tm
         ["fit", "{made}/twin", "-o", "{new}", "--method", "magic"],
         ["fit", "{made}/twin", "-o", "{new}", "--budget", "0"],
         ["fit", "{made}/twin", "-o", "{new}", "--epochs", "0"],
+        ["fit", "{made}/twin", "-o", "{new}", "--effects", "noise=on"],
+        ["fit", "{made}/twin", "-o", "{new}", "--method", "endopbr", "--effects", "gain=off"],
         ["fit", "{made}/twin", "-o", "{new}", "--seed", "-1"],
         ["eval", "{made}/twin", "--scale", "1e9"],
         ["synth", "{made}/twin", "--trajectory", "jitter:", "-o", "{new}", "--material", "gloss*2"],

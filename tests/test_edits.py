@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from endotwin.errors import OptionError
-from endotwin.synth.edits import edit_light, edit_materials, parse_light_edit, parse_material_edit
+from endotwin.synth.variation.edits import edit_light, edit_materials, parse_light_edit, parse_material_edit
 from endotwin.twin import Light, Materials
 
 VALUES = np.array([0.0, 0.2, 0.5, 0.9], np.float32)

@@ -11,13 +11,13 @@ import torch
 import tube_sequence
 
 import endotwin
-from endotwin.casting import Caster
 from endotwin.config import FitConfig
-from endotwin.evaluation import covered_pixels
+from endotwin.evaluation.evaluation import covered_pixels
 from endotwin.fit import fit
-from endotwin.fit.pace import Pace
-from endotwin.fit.samples import gather
 from endotwin.fit.solve import median_edge_mm, proxies
+from endotwin.pixels.pace import Pace
+from endotwin.pixels.samples import gather
+from endotwin.surface.casting import Caster
 
 pytestmark = pytest.mark.slow
 
@@ -193,6 +193,8 @@ def test_photos_that_show_nothing_of_the_surface_are_an_error(tube, tmp_path):
     [
         ({"config": FitConfig(method="nerf")}, "unknown method 'nerf'.*twin, endopbr"),
         ({"epochs": 3}, "epochs belong to the method endopbr"),
+        ({"effects": {"noise": "on"}}, "rendered and not fitted.*synth --effects noise=on"),
+        ({"config": FitConfig(method="endopbr"), "effects": {"gain": "on"}}, "belongs to --method twin"),
     ],
 )
 def test_options_that_make_no_sense_are_refused(tube, options, message):
@@ -230,3 +232,11 @@ def test_a_full_sequence_reaches_the_promised_accuracy(colon_direct, data_root):
     assert scores.psnr >= 38.5
     assert scores.ssim >= 0.97
     assert scores.psnr_covered >= 41
+
+
+def test_samples_carry_the_poses_and_the_camera_of_their_photos(tube):
+    samples = gather(tube, Pace(FitConfig(pixels=10_000)), 0, Caster(tube.surface))
+    views, poses = samples[::7].views, tube.sequence().T_world_camera
+    assert list(views.frames) == tube.source.training(len(poses)) and views.camera == tube.camera
+    np.testing.assert_allclose(tube.surface.to_world(views.T_local_camera), poses[views.frames], atol=1e-9)
+    assert (views.frames[views.row(samples.frame)] == samples.frame.numpy()).all()

@@ -11,7 +11,7 @@ from c3vd_folder import H, W, write_c3vd
 
 import endotwin
 from endotwin.errors import SequenceError
-from endotwin.readers import c3vd, open_sequence, transforms, tum
+from endotwin.sequence.readers import c3vd, open_sequence, transforms, tum
 
 
 def save_exr(path, depth: np.ndarray) -> None:

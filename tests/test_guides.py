@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 import trimesh
 
-from endotwin.casting import Caster
 from endotwin.fusion.mesh import surface_of
-from endotwin.guides import AT_LENS, COSINE, EXPONENTIAL, guided, log_axis, visible_from
-from endotwin.incidence import dot, unit
+from endotwin.light.guides import AT_LENS, COSINE, EXPONENTIAL, guided, log_axis, visible_from
+from endotwin.surface.casting import Caster
+from endotwin.surface.vectors import dot, unit
 
 RADIUS_MM, CENTRE_MM, WALL_MM = 2.0, 10.0, 20.0
 

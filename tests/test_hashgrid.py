@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from endotwin.hashgrid import HASH_ORIGIN, HashGrid, HashOperator, corner_slots
+from endotwin.fit.hashgrid import HASH_ORIGIN, HashGrid, HashOperator, corner_slots
 
 GRID = HashGrid(coarsest_mm=9.0, finest_mm=1.0, growth=1.7, log2_slots=9)
 """Few slots: the fine levels collide."""

@@ -5,9 +5,10 @@ import pytest
 import trimesh
 from scenes import look, pinhole
 
-from endotwin.casting import Caster, Correspondences
-from endotwin.incidence import COS_MIN, incidence, unit
+from endotwin.light.incidence import COS_MIN, incidence
 from endotwin.surface import Surface
+from endotwin.surface.casting import Caster, Correspondences
+from endotwin.surface.vectors import unit
 
 RADIUS_MM = 15.0
 ORIGIN_MM = np.array([300.0, -500.0, 900.0])

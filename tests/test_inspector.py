@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import tube_twin
 
-from endotwin import inspector
 from endotwin.errors import OptionError, OutputError, TrajectoryError
-from endotwin.poses import read_poses
+from endotwin.look import inspector
+from endotwin.sequence.poses import read_poses
 from endotwin.synth import synthesize
 from endotwin.synth.trajectories import Trajectory
 

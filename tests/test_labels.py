@@ -11,14 +11,14 @@ import trimesh
 import tube_twin
 
 from endotwin.cameras import Camera
-from endotwin.casting import Caster
 from endotwin.errors import OptionError
-from endotwin.render import Rays, Renderer
+from endotwin.render import Renderer
+from endotwin.render.renderer import Rays
 from endotwin.surface import Surface
+from endotwin.surface.casting import Caster, surface_points
 from endotwin.synth import LABELS, Trajectory, Variation, parse_labels, synthesize
-from endotwin.synth.dataset import make_job
 from endotwin.synth.encodings import ENCODINGS, encode_flow, encode_normals
-from endotwin.synth.flow import seen_from, surface_points
+from endotwin.synth.flow import seen_from
 from endotwin.synth.labels import (
     HIDDEN_NO,
     HIDDEN_NONE,
@@ -28,6 +28,7 @@ from endotwin.synth.labels import (
     MASK_VALID,
     Labeller,
 )
+from endotwin.synth.run.dataset import make_job
 from endotwin.twin import Twin
 
 RADIUS_MM = 15.0

@@ -13,8 +13,8 @@ import tube_twin
 
 from endotwin.cameras import CALIBRATIONS, Camera, Fisheye
 from endotwin.errors import OptionError
-from endotwin.readers import open_sequence
 from endotwin.render import Renderer
+from endotwin.sequence.readers import open_sequence
 from endotwin.synth import LAYOUTS, Trajectory, synthesize
 from endotwin.synth.layouts import webdataset as tars
 

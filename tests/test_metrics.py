@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from endotwin import metrics
+from endotwin.evaluation import metrics
 
 
 @pytest.fixture

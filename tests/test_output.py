@@ -10,7 +10,7 @@ import pytest
 from faults import full_disk, killed_at_every_operation
 
 from endotwin.errors import OutputError
-from endotwin.output import check_apart, check_free, check_picture, move_folder, whole_file, write_folder
+from endotwin.run.output import check_apart, check_free, check_picture, move_folder, whole_file, write_folder
 
 OWN = re.compile("mark|[a-z]-[0-9]")
 

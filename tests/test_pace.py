@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from endotwin.config import FitConfig
-from endotwin.fit.pace import Pace, spread_order
+from endotwin.pixels.pace import Pace, spread_order
 
 
 @given(st.integers(1, 300))

@@ -10,7 +10,7 @@ from endotwin.effects import Effects, effect_class
 from endotwin.errors import OptionError
 from endotwin.render import Renderer
 from endotwin.synth.photograph import photographed
-from endotwin.synth.switches import equipped
+from endotwin.synth.variation.switches import equipped
 
 
 @pytest.fixture(scope="module")

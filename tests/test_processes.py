@@ -7,7 +7,7 @@ import psutil
 import pytest
 
 from endotwin.errors import OutputError
-from endotwin.processes import Pool
+from endotwin.run.processes import Pool
 
 pytestmark = pytest.mark.slow
 

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 import trimesh
 
-from endotwin.casting import Caster
 from endotwin.fusion.mesh import surface_of
-from endotwin.guides import COSINE
-from endotwin.radiosity import BOUNCES, Radiosity
+from endotwin.light.guides import COSINE
+from endotwin.light.radiosity import BOUNCES, Radiosity
+from endotwin.surface.casting import Caster
 
 RADIUS_MM = 10.0
 

@@ -19,9 +19,9 @@ from scipy.spatial.transform import Rotation
 
 from endotwin.cameras import CALIBRATIONS, Fisheye, Pinhole
 from endotwin.errors import CameraError, OptionError, SequenceError, TrajectoryError
-from endotwin.images import PNG_SIGNATURE
-from endotwin.poses import read_poses, write_c3vd_poses
-from endotwin.readers import FORMATS, open_sequence
+from endotwin.sequence.images import PNG_SIGNATURE
+from endotwin.sequence.poses import read_poses, write_c3vd_poses
+from endotwin.sequence.readers import FORMATS, open_sequence
 
 
 def png(path, array):
@@ -550,7 +550,7 @@ def test_a_tiff_that_lost_its_end_prints_nothing_but_the_error(tmp_path, compres
     content = file.read_bytes()
     file.write_bytes(content[: len(content) // 2])
     code = (
-        "import sys; from endotwin.readers import open_sequence\n"
+        "import sys; from endotwin.sequence.readers import open_sequence\n"
         "try: open_sequence(sys.argv[1]).depth_mm(0)\n"
         "except Exception as error: print(error)"
     )

@@ -14,10 +14,11 @@ import pytest
 import tube_twin
 
 from endotwin.errors import OptionError, OutputError
-from endotwin.synth import Trajectory, Variation, crew, make_job, synthesize
+from endotwin.synth import Trajectory, Variation, make_job, synthesize
 from endotwin.synth.labels import Labeller
-from endotwin.synth.partial import Partial, partial_path
-from endotwin.synth.shard import render_shard
+from endotwin.synth.run import crew
+from endotwin.synth.run.partial import Partial, partial_path
+from endotwin.synth.run.shard import render_shard
 from endotwin.twin import Twin
 
 pytestmark = pytest.mark.slow

@@ -7,8 +7,8 @@ from c3vd_folder import write_c3vd
 from scipy.ndimage import map_coordinates
 
 from endotwin.errors import SequenceError
-from endotwin.readers import open_sequence
-from endotwin.sequence import dark_surround, resized_depth
+from endotwin.sequence.readers import open_sequence
+from endotwin.sequence.sequence import dark_surround, resized_depth
 
 
 def circle_image(height=120, width=160, radius=70, seed=0):

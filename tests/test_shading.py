@@ -8,7 +8,7 @@ import pytest
 import torch
 from scipy.integrate import quad
 
-from endotwin import shading
+from endotwin.light import shading
 
 ROUGHNESS = (0.05, 0.1, 0.25, 0.5, 0.8, 1.0)
 COS = (1.0, 0.999, 0.9, 0.6, 0.3, 0.1, 0.01)

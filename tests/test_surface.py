@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import trimesh
+from safetensors.numpy import save_file
 
 from endotwin.surface import Surface
 
@@ -37,10 +38,10 @@ def test_a_pose_made_local_sees_the_local_vertices_as_the_pose_sees_the_world(sp
 
 def test_a_new_surface_is_unseen_and_coverage_changes_nothing_else(sphere):
     surface = Surface.from_mesh(sphere.vertices, sphere.faces, sphere.vertex_normals)
-    assert not surface.seen_by.any() and not surface.best_cosine.any() and not surface.filled.any()
+    assert not surface.seen_by.any() and not surface.filled.any()
     assert np.isinf(surface.nearest_mm).all()
     count = len(surface.vertices_mm)
-    seen = surface.with_coverage(np.full(count, 3, np.int32), np.ones(count), np.ones(count))
+    seen = surface.with_coverage(np.full(count, 3, np.int32), np.ones(count))
     assert (seen.seen_by == 3).all() and not surface.seen_by.any()
     assert seen.vertices_mm is surface.vertices_mm and seen.triangles is surface.triangles
 
@@ -51,7 +52,6 @@ def test_saving_and_loading_is_exact_to_the_bit(sphere, tmp_path):
     count = len(surface.vertices_mm)
     surface = surface.with_coverage(
         generator.integers(0, 9, count).astype(np.int32),
-        generator.random(count, np.float32),
         np.where(generator.random(count) < 0.5, np.inf, 7.0).astype(np.float32),
     )
     (tmp_path / "surface.safetensors").write_bytes(surface.to_bytes())
@@ -67,9 +67,16 @@ def test_views_into_larger_arrays_are_saved_as_what_they_show(sphere, tmp_path):
     wide = np.repeat(sphere.vertices.astype(np.float32), 2, axis=0)
     surface = Surface.from_mesh(sphere.vertices, sphere.faces, wide[::2])
     strided = np.arange(2 * len(wide[::2]), dtype=np.int32)[::2]
-    covered = surface.with_coverage(strided, surface.best_cosine, surface.nearest_mm)
+    covered = surface.with_coverage(strided, surface.nearest_mm)
     (tmp_path / "s.safetensors").write_bytes(covered.to_bytes())
     np.testing.assert_array_equal(Surface.load(tmp_path / "s.safetensors").seen_by, strided)
+
+
+def test_an_array_that_a_surface_no_longer_has_is_passed_over(sphere, tmp_path):
+    surface = Surface.from_mesh(sphere.vertices, sphere.faces, sphere.vertices.astype(np.float32))
+    older = {**vars(surface), "best_cosine": np.zeros(len(sphere.vertices), np.float32)}
+    save_file(older, tmp_path / "surface.safetensors")
+    np.testing.assert_array_equal(Surface.load(tmp_path / "surface.safetensors").normals, surface.normals)
 
 
 def test_an_empty_mesh_is_a_surface():

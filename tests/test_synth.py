@@ -10,8 +10,8 @@ import tifffile
 import tube_twin
 
 from endotwin.errors import OutputError, TwinError
-from endotwin.readers import open_sequence
 from endotwin.render import Renderer
+from endotwin.sequence.readers import open_sequence
 from endotwin.synth import (
     DEFAULT_LABELS,
     Trajectory,
@@ -87,9 +87,7 @@ def test_depth_and_normals_are_those_of_the_true_tube(trajectory, written):
 def test_the_mask_tells_photographed_from_unseen_surface_and_from_none(trajectory, tmp_path):
     mesh = tube_twin.seen(tube_twin.surface())
     s = tube_twin.to_axis(mesh.vertices_mm + mesh.origin_mm)[0]
-    half = mesh.with_coverage(
-        np.where(s < 0.6, mesh.seen_by, 0).astype(np.int32), mesh.best_cosine, mesh.nearest_mm
-    )
+    half = mesh.with_coverage(np.where(s < 0.6, mesh.seen_by, 0).astype(np.int32), mesh.nearest_mm)
     folder = tmp_path / "dataset"
     summary = synthesize(tube_twin.fitted(half), trajectory, folder)
     v, u = np.meshgrid(np.arange(72.0), np.arange(96.0), indexing="ij")

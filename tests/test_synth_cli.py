@@ -13,8 +13,8 @@ from endotwin.cli import console
 from endotwin.cli import synth as command
 from endotwin.cli.main import main
 
-from endotwin.poses import write_c3vd_poses
-from endotwin.readers import open_sequence
+from endotwin.sequence.poses import write_c3vd_poses
+from endotwin.sequence.readers import open_sequence
 from endotwin.synth import DEFAULT_LABELS, LABELS, LAYOUTS
 
 FRAMES = 40
@@ -100,6 +100,7 @@ def test_progress_shows_frames_a_second():
         (["-o", "{new}", "--vary", "nowhere.yaml"], "nowhere.yaml"),
         (["-o", "{new}", "--clearance", "-1"], "clearance"),
         (["-o", "{new}", "--max-unseen", "2"], "unseen"),
+        (["-o", "{new}", "--effects", "noise=auto"], "noise=on or off"),
         (["-o", "{new}", "--max-distance", "5"], "nowhere"),
         (["-o", "{new}", "--workers", "-1"], "workers"),
         (["--preview", "{new}.jpg"], "png"),

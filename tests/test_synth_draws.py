@@ -6,14 +6,13 @@ import numpy as np
 import pytest
 import tube_twin
 
-from endotwin import illumination
 from endotwin.effects import Effects, effect_class
-from endotwin.render import Renderer
+from endotwin.render import Renderer, illumination
 from endotwin.synth import Trajectory, fixed, parse_labels, parse_material_edit
-from endotwin.synth.dataset import make_job
-from endotwin.synth.edits import edit_materials
 from endotwin.synth.labels import Labeller
+from endotwin.synth.run.dataset import make_job
 from endotwin.synth.variation import read_variation
+from endotwin.synth.variation.edits import edit_materials
 
 FRAMES = 6
 VARIED = {

@@ -14,9 +14,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
-from endotwin import shading
-from endotwin.readers import open_sequence
+from endotwin.light import shading
 from endotwin.render import Renderer
+from endotwin.sequence.readers import open_sequence
 from endotwin.synth import LAYOUTS, Trajectory, synthesize
 from endotwin.synth.encodings import ENCODINGS
 

@@ -18,7 +18,7 @@ from hypothesis.extra import numpy as arrays
 from endotwin.config import Config, FitConfig, FuseConfig, load_config, preset_names
 from endotwin.effects import RENDERED
 from endotwin.errors import OptionError, OutputError
-from endotwin.readers import open_sequence
+from endotwin.sequence.readers import open_sequence
 from endotwin.tradeoff import LADDER, effects, ladder, run, tradeoff
 from endotwin.tradeoff.crops import telling_patch
 from endotwin.tradeoff.knee import knee, pareto_front

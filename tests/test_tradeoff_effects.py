@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from endotwin.effects import FITTED, RENDERED, Decision
 from endotwin.errors import OptionError
-from endotwin.readers import open_sequence
+from endotwin.sequence.readers import open_sequence
 from endotwin.tradeoff import effects
 from endotwin.tradeoff.by_effect import section, table
 from endotwin.tradeoff.plot import _apart, draw_effects

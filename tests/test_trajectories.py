@@ -11,12 +11,12 @@ from scipy.spatial.transform import Rotation
 
 from endotwin import pipeline
 from endotwin.errors import OptionError, SequenceError, TrajectoryError
-from endotwin.poses import write_c3vd_poses
+from endotwin.sequence.poses import write_c3vd_poses
 from endotwin.synth import parse_trajectory, synthesize
-from endotwin.synth.centerline import find_centerline
-from endotwin.synth.lumen import Lumen
-from endotwin.synth.screening import Gate, Limits
 from endotwin.synth.trajectories import Trajectory
+from endotwin.synth.trajectories.centerline import find_centerline
+from endotwin.synth.trajectories.lumen import Lumen
+from endotwin.synth.trajectories.screening import Gate, Limits
 
 pytestmark = pytest.mark.slow
 
@@ -62,7 +62,7 @@ def test_the_centreline_runs_the_way_the_training_cameras_looked(towards):
 def test_the_centreline_stays_where_the_wall_was_photographed():
     mesh = tube_twin.seen(tube_twin.surface())
     s = tube_twin.to_axis(mesh.vertices_mm + mesh.origin_mm)[0]
-    half = mesh.with_coverage(np.where(s < 0.8, mesh.seen_by, 0), mesh.best_cosine, mesh.nearest_mm)
+    half = mesh.with_coverage(np.where(s < 0.8, mesh.seen_by, 0), mesh.nearest_mm)
     on_line = tube_twin.to_axis(find_centerline(Lumen(half)).points_mm)[0]
     assert 0.65 < on_line.max() < 0.82
 

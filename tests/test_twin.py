@@ -10,9 +10,14 @@ from faults import full_disk, killed_at_every_operation
 from safetensors.numpy import save_file
 from scenes import omni
 
-from endotwin.effects import Decision
+from endotwin.effects import Decision, Effects
+from endotwin.effects.gain import Gain
+from endotwin.effects.offset import Offset
+from endotwin.effects.shadows import Shadows
+from endotwin.effects.vignetting import Vignetting
 from endotwin.errors import OutputError, TwinError
-from endotwin.twin import VERSION, Source, Twin
+from endotwin.twin import Source, Twin
+from endotwin.twin.twin import VERSION
 
 
 @pytest.fixture(scope="module")
@@ -64,6 +69,20 @@ def test_print_tells_light_response_and_scores(twin):
     text = repr(twin.with_record(eval={"psnr": 38.512, "ssim": 0.9712}))
     for part in ("26,400 vertices", "omni", "n 2.000", "q 2.000", "0.4545", "38.51 dB", "0.9712"):
         assert part in text
+
+
+def test_print_tells_the_effects_and_where_the_guides_are(twin):
+    effects = [
+        Offset(((3.24, 0.55, 0.0), (-2.8, 2.0, 0.0))),
+        Shadows(),
+        Gain((1, 2), (-0.1, 0.1)),
+        Vignetting(-0.3, 0.05),
+    ]
+    assert "effects: none" in repr(replace(twin, effects=Effects()))
+    assert (
+        "effects: offset (guides at (3.24, 0.55, 0.00), (-2.80, 2.00, 0.00) mm), shadows, "
+        "gain (×0.90 to ×1.11), vignetting (k2 -0.3, k4 0.05)"
+    ) in repr(replace(twin, effects=Effects(effects)))
 
 
 def test_a_twin_of_a_newer_version_is_refused(twin, tmp_path):

@@ -12,7 +12,7 @@ import tube_twin
 from endotwin import pipeline
 from endotwin.effects.offset import Offset
 from endotwin.errors import OptionError
-from endotwin.poses import write_c3vd_poses
+from endotwin.sequence.poses import write_c3vd_poses
 from endotwin.synth import Trajectory, fixed, parse_light_edit, parse_material_edit, synthesize
 from endotwin.synth.variation import Variation, read_variation
 
@@ -162,9 +162,12 @@ def test_effects_are_switched_by_their_chance_and_their_parameters_drawn(ranges,
 def test_the_lights_offset_moves_every_guide(ranges, twin):
     draw = ranges("light: [offset.x+2..2, offset.y*0.5]").draw(1, 0)[0]
     beside, _ = draw.edited(twin)
-    assert beside.effects.guides_mm == ((2.0, 0.0, 0.0),)
+    assert beside.effects.guides_mm == ((2.0, 0.0, 0.0),) and "shadows" in beside.effects
     two = replace(twin, effects=twin.effects.including(Offset(((1.0, 2.0, 0.0), (-3.0, 2.0, 0.0)))))
-    assert draw.edited(two)[0].effects.guides_mm == ((3.0, 1.0, 0.0), (-1.0, 1.0, 0.0))
+    moved = draw.edited(two)[0].effects
+    assert moved.guides_mm == ((3.0, 1.0, 0.0), (-1.0, 1.0, 0.0)) and "shadows" not in moved
+    unshadowed = replace(draw, effects=(("shadows", False),))
+    assert "shadows" not in unshadowed.edited(twin)[0].effects
 
 
 def test_varied_frames_do_not_depend_on_where_a_run_stopped(ranges, twin, tmp_path):

@@ -6,9 +6,17 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import torch
 
-from endotwin.cameras import Pinhole
+from endotwin.cameras import Camera, Pinhole
+from endotwin.fit.gauss_newton import State, roughness_to_raw
+from endotwin.fit.hashgrid import HashOperator
+from endotwin.fit.model import Globals
+from endotwin.light.incidence import incidence
+from endotwin.pixels.samples import Samples, Views
+from endotwin.render import Renderer
 from endotwin.surface import Surface
+from endotwin.surface.casting import Caster
 from endotwin.twin import Light, Materials, Response, Source, Twin
 
 RADIUS_MM, BEND_MM, SWEEP = 12.0, 60.0, np.pi / 2
@@ -71,9 +79,7 @@ def seen(unseen: Surface, towards: float = 1.0) -> Surface:
     s, _ = to_axis(unseen.vertices_mm + unseen.origin_mm)
     nearest_mm = 15 + BEND_MM * (s if towards > 0 else SWEEP - s)
     count = len(s)
-    return unseen.with_coverage(
-        np.full(count, 5, np.int32), np.full(count, 0.7, np.float32), nearest_mm.astype(np.float32)
-    )
+    return unseen.with_coverage(np.full(count, 5, np.int32), nearest_mm.astype(np.float32))
 
 
 def fitted(mesh: Surface, source: Path | str = "nowhere") -> Twin:
@@ -87,6 +93,38 @@ def fitted(mesh: Surface, source: Path | str = "nowhere") -> Twin:
     )
     light, response = Light(L0=20.0, n=2.0, q=2.0), Response(gamma=1 / 2.2)
     return Twin(mesh, CAMERA, Source(str(source), "c3vd"), materials, light, response)
+
+
+def photographed(twin: Twin, camera: Camera, poses: np.ndarray) -> Samples:
+    """All pixels of ``twin`` as rendered from ``poses`` [F, 4, 4], as training samples."""
+    renderer, caster, parts = Renderer(twin, camera), Caster(twin.surface), []
+    for frame, pose in enumerate(poses):
+        photo = np.uint8(renderer.view(pose).color * 255 + 0.5)
+        hits = caster.cast(camera, pose)
+        parts.append(
+            {
+                **vars(incidence(hits, twin.surface, camera, pose)),
+                "triangle": hits.triangle.astype(np.int64),
+                "barycentric": hits.barycentric,
+                "color": photo.reshape(-1, 3)[hits.pixel],
+                "frame": np.full(len(hits), frame, np.int32),
+                "pixel": hits.pixel,
+            }
+        )
+    columns = {name: torch.from_numpy(np.concatenate([part[name] for part in parts])) for name in parts[0]}
+    mask = np.ones((camera.height, camera.width), bool)
+    views = Views(camera, mask, np.arange(len(poses)), twin.surface.to_local(poses))
+    return Samples(**columns, views=views)[torch.argsort(columns["triangle"], stable=True)]
+
+
+def state_of(twin: Twin) -> State:
+    """The state of a fit that has found all of ``twin``, which has no metallic."""
+    shown = torch.from_numpy(twin.materials.base_color) ** twin.response.gamma
+    rough = torch.tensor([roughness_to_raw(float(value)) for value in twin.materials.roughness])
+    mean = torch.cat([shown, rough[:, None]], dim=1).float()
+    operator = HashOperator.each(len(mean), 0.4)
+    table = torch.zeros(operator.forward_csr.shape[1], 4)
+    return State(operator, mean, table, Globals.of(twin.light, twin.response, twin.materials.f0))
 
 
 def unfitted(twin: Twin) -> Twin:

@@ -13,7 +13,7 @@ from endotwin.cameras.fisheye import Fisheye
 from endotwin.cameras.omni import Omni
 from endotwin.cameras.pinhole import Pinhole
 from endotwin.errors import CameraError
-from endotwin.jsontext import parsed
+from endotwin.run.jsontext import parsed
 
 __all__ = [
     "CALIBRATIONS",

@@ -39,7 +39,7 @@ from endotwin.check.reading import OPENGL, Lens, Reading
 from endotwin.check.search import Candidate, Found, best_reading
 from endotwin.check.views import Views, read_views
 from endotwin.check.warp import disagreement
-from endotwin.poses import AXES_OPENGL_OPENCV
+from endotwin.sequence.poses import AXES_OPENGL_OPENCV
 
 __all__ = ["KINDS", "Finding", "Report", "check"]
 
@@ -56,7 +56,7 @@ def check(path: Path | str, format: str | None = None, progress: Progress | None
 
     Args:
         path: its folder, or its ``transforms.json``.
-        format: one of ``endotwin.readers.FORMATS``; detected unless given.
+        format: one of ``endotwin.sequence.readers.FORMATS``; detected unless given.
 
     Raises:
         SequenceError, CameraError, OptionError: it cannot be read, for a reason that no reading mends.

@@ -10,7 +10,7 @@ import numpy as np
 LEAST_COSINE = 0.25
 """Pixels whose ray is farther off the optical axis are left alone: z-depth says nothing at 90°."""
 
-JUMP = 0.003
+SMOOTH_BEND = 0.003
 """Relative second difference of a smooth surface, at most, where there is no noise."""
 
 QUIET = 1e-3
@@ -40,7 +40,7 @@ def prepared(depth_mm: np.ndarray, cosine: np.ndarray) -> DepthMap:
     inverse = np.where(usable, 1 / np.where(usable, depth_mm, 1), np.nan).astype(np.float32)
     bends = [_bend(inverse, axis) for axis in (0, 1)]
     noise = float(np.hypot(_spread(bends), _step(depth_mm[usable])))
-    smooth = (bends[0] < JUMP + 6 * noise) & (bends[1] < JUMP + 6 * noise)
+    smooth = (bends[0] < SMOOTH_BEND + 6 * noise) & (bends[1] < SMOOTH_BEND + 6 * noise)
     flat = cv2.erode(smooth.astype(np.uint8), np.ones((3, 3), np.uint8), borderValue=0) > 0
     inverse[~flat] = np.nan
     radius = noise / QUIET / (2 * np.sqrt(np.pi))

@@ -11,10 +11,10 @@ import numpy as np
 from endotwin.check.files import files_of
 from endotwin.check.findings import Finding
 from endotwin.errors import CameraError, SequenceError
-from endotwin.images import read_color, read_plane
-from endotwin.poses import AXES_OPENGL_OPENCV, MM_PER_UNIT, RIGID_TOLERANCE, poses_as_written
-from endotwin.readers import FORMATS, open_sequence
 from endotwin.sequence import Sequence
+from endotwin.sequence.images import read_color, read_plane
+from endotwin.sequence.poses import AXES_OPENGL_OPENCV, MM_PER_UNIT, RIGID_TOLERANCE, poses_as_written
+from endotwin.sequence.readers import FORMATS, open_sequence
 
 
 @dataclass(frozen=True)

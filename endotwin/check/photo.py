@@ -16,8 +16,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from endotwin.ahead import ahead
 from endotwin.check.depths import LEAST_COSINE, QUIET, prepared
+from endotwin.run.ahead import ahead
 from endotwin.sequence import Sequence
 
 GRID = 320  # pixels across the reduced images that are correlated

@@ -22,7 +22,7 @@ KEPT = {"poses": 6}
 KEPT_OF_OTHERS = 3
 """How many candidates of a kind are looked at closely."""
 ROUGHLY, FINELY = 0.1, 0.002
-ROUNDS = 3
+MOST_MISTAKES = 3
 COMPLEXITY = 0.004
 """Cost that one more mistake, or a rarer one, has to save."""
 NEEDED_GAIN = 0.15
@@ -67,7 +67,7 @@ def best_reading(views: Views, start: Reading, tolerated: float, forced: tuple[C
     coarse, middle = shuffled[:COARSE], shuffled[:MIDDLE]
     before = disagreement(views, start, middle)
     reading, kinds, now = start, (), before
-    for round_ in range(ROUNDS):
+    for round_ in range(MOST_MISTAKES):
         if not (forced and round_ == 0) and now.median <= tolerated and now.lands > 0.2:
             break
         choices = list(forced if forced and round_ == 0 else candidates(views, reading, kinds))

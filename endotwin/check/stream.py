@@ -13,12 +13,12 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from endotwin.ahead import ahead
 from endotwin.check.depths import lookup, prepared
 from endotwin.check.photo import brightest, correlation, reduced_photo, reduced_shading
 from endotwin.check.reading import Reading
 from endotwin.check.views import Views, sampled
 from endotwin.check.warp import landed, residuals
+from endotwin.run.ahead import ahead
 from endotwin.sequence import Sequence
 
 POINTS = 2000

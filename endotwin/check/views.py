@@ -6,8 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from endotwin.ahead import ahead
 from endotwin.check.depths import prepared
+from endotwin.run.ahead import ahead
+from endotwin.run.threads import THREADS
 from endotwin.sequence import Sequence
 
 GROUPS, GROUP = 4, 6
@@ -15,7 +16,6 @@ GROUPS, GROUP = 4, 6
 REACH = 60
 WIDEST_DEG = 30.0
 SAMPLES = 100_000
-THREADS = 2
 
 
 @dataclass(frozen=True)

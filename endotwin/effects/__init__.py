@@ -1,7 +1,7 @@
 """Effects: what a scene may have beside the paper's light, each simulated only where it is called for.
 
-One module an effect, of the effect's name; ``effect`` says what they share, ``decide`` which of them a
-scene calls for.
+One module an effect, of the effect's name; ``effect`` says what they share. Which of them a scene calls
+for is decided in ``endotwin.evidence``.
 """
 
 from __future__ import annotations

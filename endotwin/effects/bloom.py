@@ -34,9 +34,8 @@ class Bloom(Effect):
     """
 
     name: ClassVar[str] = "bloom"
-    kind: ClassVar[str] = "optics"
-    share: float = parameter(0.2, 0.0, 1.0, "1")
-    radius: float = parameter(0.01, 0.0, 0.2, "1")
+    share: float = parameter(0.2, 0.0, 1.0)
+    radius: float = parameter(0.01, 0.0, 0.2)
 
     def through(self, radiance: Tensor, depth_mm: np.ndarray | Tensor, camera: Camera) -> Tensor:
         """Radiance float32 [H, W, 3] with its glare."""

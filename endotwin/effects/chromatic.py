@@ -45,9 +45,8 @@ class Chromatic(Effect):
     """
 
     name: ClassVar[str] = "chromatic"
-    kind: ClassVar[str] = "optics"
-    red: float = parameter(-0.001, -0.02, 0.02, "1")
-    blue: float = parameter(0.001, -0.02, 0.02, "1")
+    red: float = parameter(-0.001, -0.02, 0.02)
+    blue: float = parameter(0.001, -0.02, 0.02)
 
     def through(self, radiance: Tensor, depth_mm: np.ndarray | Tensor, camera: Camera) -> Tensor:
         """Radiance float32 [H, W, 3] as the lens images it; beyond the image is what its border shows."""

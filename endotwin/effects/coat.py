@@ -1,4 +1,4 @@
-"""Wet coat: a thin clear film over the tissue with a lobe of its own, sharper than the tissue's."""
+"""Wet coat: a thin clear liquid over the tissue with a lobe of its own, sharper than the tissue's."""
 
 from __future__ import annotations
 
@@ -7,18 +7,14 @@ from typing import ClassVar
 
 from endotwin.effects.effect import Effect, parameter
 
-F0_WATER = 0.02
-"""((1.33 − 1) / (1.33 + 1))²."""
-
 
 @dataclass(frozen=True)
 class Coat(Effect):
     """A second GGX lobe, weight·D·F·G/4(n·ωi)(n·ωo) with F = 0.02 of water (Burley 2012, clearcoat).
 
-    It adds to the other lobes; what the film takes from them (at most 4 %) is left to the fitted base colour.
+    It adds to the other lobes; what it takes from them (at most 4 %) is left to the fitted base colour.
     """
 
     name: ClassVar[str] = "coat"
-    kind: ClassVar[str] = "surface"
-    weight: float = parameter(1.0, 0.0, 50.0, "1")
-    roughness: float = parameter(0.12, 0.045, 1.0, "1")
+    weight: float = parameter(1.0, 0.0, 50.0)
+    roughness: float = parameter(0.12, 0.045, 1.0)

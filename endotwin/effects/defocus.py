@@ -46,9 +46,8 @@ class Defocus(Effect):
     """
 
     name: ClassVar[str] = "defocus"
-    kind: ClassVar[str] = "optics"
-    aperture_mm: float = parameter(0.1, 0.0, 5.0, "mm")
-    focus_mm: float = parameter(15.0, 0.5, 1000.0, "mm")
+    aperture_mm: float = parameter(0.1, 0.0, 5.0)
+    focus_mm: float = parameter(15.0, 0.5, 1000.0)
 
     def blur_radius_px(self, depth_mm: np.ndarray | Tensor, camera: Camera) -> np.ndarray:
         """Radius of each pixel's disc, float32 [H, W]: positive beyond the focus, negative before it."""

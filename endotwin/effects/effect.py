@@ -1,13 +1,13 @@
-"""What every effect is: named parameters with bounds and units, and how it changes the picture.
+"""What every effect is: named parameters with bounds, and how it changes the picture.
 
-An effect is a frozen dataclass whose fields are its parameters, in a module of its name. There are five
-kinds, by where light meets them on its way:
+An effect is a frozen dataclass whose fields are its parameters, in a module of its name. Light meets them
+on its way in this order:
 
-- ``light``: where the light comes from and how it falls (offset, profile, shadows, interreflection);
-- ``surface``: how tissue answers it (specular, coat);
-- ``exposure``: when pixels see it (motion blur, rolling shutter);
-- ``optics``: what the lens makes of the radiance image (vignetting, defocus, chromatic, bloom, lens);
-- ``sensor``: what the sensor makes of that (gain, noise).
+- where it comes from and how it falls (offset, profile, shadows, interreflection);
+- how tissue answers it (specular, coat);
+- when pixels see it (motion blur, rolling shutter);
+- what the lens makes of the radiance image (vignetting, defocus, chromatic, bloom, lens);
+- what the sensor makes of that (gain, noise).
 """
 
 from __future__ import annotations
@@ -16,23 +16,21 @@ from dataclasses import dataclass, field
 from dataclasses import fields as dataclass_fields
 from typing import ClassVar
 
-KINDS = ("light", "surface", "exposure", "optics", "sensor")
 STATES = ("auto", "on", "off")
 
 
 @dataclass(frozen=True)
 class Parameter:
-    """A parameter as a user sees it: bounds that it may take, and its unit ("1" if it has none)."""
+    """A parameter as a user sees it, and the bounds that it may take."""
 
     name: str
     low: float
     high: float
-    unit: str
 
 
-def parameter(default: float, low: float, high: float, unit: str) -> float:
+def parameter(default: float, low: float, high: float) -> float:
     """A dataclass field that is a scalar parameter."""
-    return field(default=default, metadata={"low": low, "high": high, "unit": unit})
+    return field(default=default, metadata={"low": low, "high": high})
 
 
 @dataclass(frozen=True)
@@ -40,15 +38,19 @@ class Effect:
     """Base of all effects."""
 
     name: ClassVar[str]
-    kind: ClassVar[str]
+
+    def __str__(self) -> str:
+        """The name, and the scalar parameters with their values."""
+        told = ", ".join(f"{each.name} {getattr(self, each.name):.4g}" for each in self.parameters())
+        return f"{self.name} ({told})" if told else self.name
 
     @classmethod
     def parameters(cls) -> tuple[Parameter, ...]:
         """The scalar parameters, in the order of the fields."""
         return tuple(
-            Parameter(f.name, f.metadata["low"], f.metadata["high"], f.metadata["unit"])
+            Parameter(f.name, f.metadata["low"], f.metadata["high"])
             for f in dataclass_fields(cls)
-            if "unit" in f.metadata
+            if "low" in f.metadata
         )
 
 

@@ -12,7 +12,6 @@ from collections.abc import Sequence as Ordered
 from dataclasses import dataclass
 from functools import cached_property
 from math import ceil
-from typing import ClassVar
 
 import numpy as np
 import torch
@@ -100,8 +99,6 @@ class Shot:
 
 class ExposureEffect(Effect):
     """An effect that says when rows are exposed; ``expose`` then is one for all of them."""
-
-    kind: ClassVar[str] = "exposure"
 
     def timed(self, shot: Shot) -> Shot:
         """The shot, taken this way."""

@@ -33,8 +33,7 @@ class Lens(Effect):
     """
 
     name: ClassVar[str] = "lens"
-    kind: ClassVar[str] = "optics"
-    half_angle_deg: float = parameter(WHOLE_FIELD_DEG, 1.0, WHOLE_FIELD_DEG, "degree")
+    half_angle_deg: float = parameter(WHOLE_FIELD_DEG, 1.0, WHOLE_FIELD_DEG)
 
     def mask(self, camera: Camera) -> np.ndarray:
         """Bool [H, W]: pixels whose ray passes the stop."""
@@ -45,20 +44,24 @@ class Lens(Effect):
         return radiance * torch.from_numpy(_passed(camera, self.half_angle_deg))[..., None]
 
     @classmethod
-    def measured(cls, sequence: Sequence) -> tuple[Lens, float]:
-        """The stop as wide as the photos' lit area, and the share of pixels it puts on the right side."""
-        lit = sequence.lens_mask
+    def measured(cls, camera: Camera, lit: np.ndarray) -> tuple[Lens, float]:
+        """The stop as wide as the photos' ``lit`` area [H, W], and the share of pixels it puts on the right
+        side."""
         if lit.mean() >= FULL:
             return cls(), float(lit.mean())
-        angle = np.nan_to_num(angle_from_axis(sequence.camera), nan=np.pi)
+        angle = np.nan_to_num(angle_from_axis(camera), nan=np.pi)
         half_angle = float(np.quantile(angle, lit.mean()))
         return cls(float(np.degrees(half_angle))), float(((angle <= half_angle) == lit).mean())
 
     @classmethod
     def evidence(cls, sequence: Sequence) -> tuple[Lens | None, str]:
         """A black surround in the photos, or a camera model that no plain pinhole is."""
-        lens, agreement = cls.measured(sequence)
-        camera = sequence.camera
+        return cls.told_by(sequence.camera, sequence.lens_mask)
+
+    @classmethod
+    def told_by(cls, camera: Camera, lens_mask: np.ndarray) -> tuple[Lens | None, str]:
+        """The evidence of photos that are lit where ``lens_mask`` [H, W] says."""
+        lens, agreement = cls.measured(camera, lens_mask)
         if lens.half_angle_deg < WHOLE_FIELD_DEG:
             return lens, (
                 f"the photos are black beyond {lens.half_angle_deg:.1f}° from the axis "

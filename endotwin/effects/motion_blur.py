@@ -23,7 +23,7 @@ class MotionBlur(ExposureEffect):
     """
 
     name: ClassVar[str] = "motion_blur"
-    shutter: float = parameter(0.5, 0.0, 1.0, "frame")
+    shutter: float = parameter(0.5, 0.0, 1.0)
 
     def timed(self, shot: Shot) -> Shot:
         return replace(shot, shutter=self.shutter)

@@ -49,9 +49,8 @@ class Noise(Effect):
     """
 
     name: ClassVar[str] = "noise"
-    kind: ClassVar[str] = "sensor"
-    read_noise: float = parameter(LEVEL, 0.0, 0.2, "display value")
-    shot_noise: float = parameter(0.0, 0.0, 0.05, "display value")
+    read_noise: float = parameter(LEVEL, 0.0, 0.2)
+    shot_noise: float = parameter(0.0, 0.0, 0.05)
 
     def sigma(self, color: np.ndarray | float) -> np.ndarray:
         """Standard deviation at display values in [0, 1], of the same shape."""

@@ -2,27 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from itertools import combinations
+from dataclasses import dataclass
 from typing import ClassVar
 
-import numpy as np
-from scipy.optimize import minimize
-
 from endotwin.effects.effect import Effect
-from endotwin.effects.probe import Fitted, Hypothesis, Probe
-
-RING = 0.12
-"""Radius of the ring on which guides are first sought, as a share of the median viewing distance: a tip
-that sees the wall at 20 mm has its guides within some 4 mm."""
-
-RING_RADII = (0.5, 1.0)
-RING_POINTS = 8
-MOST_GUIDES = 3
-REFINE_STEPS, SPREAD = 90, 0.2
-POLISH_STEPS, POLISH_SPREAD = 30, 0.05
-TOLERANCE = 1e-3
-"""The search ends when positions move by less than this share of the ring's radius, and the loss by less."""
 
 
 @dataclass(frozen=True)
@@ -33,85 +16,8 @@ class Offset(Effect):
     """
 
     name: ClassVar[str] = "offset"
-    kind: ClassVar[str] = "light"
     guides_mm: tuple[tuple[float, float, float], ...] = ()
 
-
-def ring_mm(probe: Probe, share: float = 1.0) -> np.ndarray:
-    """Positions about the lens, float32 [RING_POINTS, 3]."""
-    radius_mm = share * RING * float(np.exp(np.median(probe.samples.log_distance.numpy())))
-    angle = 2 * np.pi * np.arange(RING_POINTS) / RING_POINTS
-    return (radius_mm * np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)).astype(np.float32)
-
-
-def shadow_columns(probe: Probe) -> np.ndarray:
-    """What each guide on the inner ring would leave in shadow, [N, RING_POINTS]: the trace of an offset.
-
-    A guide farther out shades all of that, and more.
-    """
-    ring = ring_mm(probe, RING_RADII[0])
-    return np.stack([~probe.visible(guide) for guide in ring], axis=1).astype(np.float64)
-
-
-class Search:
-    """Guide positions that predict a probe's pixels best, shadows included."""
-
-    def __init__(self, probe: Probe, base: Fitted):
-        self._probe, self._base = probe, base
-        self._candidates = np.concatenate([ring_mm(probe, share) for share in RING_RADII])
-        self._visible = [probe.visible(guide) for guide in self._candidates]
-        self._at_risk = np.flatnonzero(~np.logical_and.reduce(self._visible))
-        self._radius_mm = float(np.abs(self._candidates).max())
-
-    def best(self, number: int, fewer: Fitted | None) -> Hypothesis:
-        """The best hypothesis with ``number`` guides; ``fewer`` is the one with one less, if any was good."""
-        if fewer is None:
-            start = min(combinations(range(len(self._candidates)), number), key=self._candidate_loss)
-            start_mm = self._candidates[list(start)]
-        else:
-            known = np.asarray(fewer.hypothesis.guides_mm, np.float32)
-            joined = [np.vstack([known, candidate]) for candidate in self._candidates]
-            start_mm = min(joined, key=self._loss)
-        return self._refined(start_mm, REFINE_STEPS, SPREAD)
-
-    def polished(self) -> Hypothesis:
-        """The base with its own guides moved to where they predict best beside all that was kept since."""
-        base = self._base.hypothesis
-        refined = self._refined(np.asarray(base.guides_mm), POLISH_STEPS, POLISH_SPREAD)
-        return replace(refined, shadows=base.shadows)
-
-    def _refined(self, start_mm: np.ndarray, steps: int, spread: float) -> Hypothesis:
-        """Guides moved from ``start_mm`` [K, 3] by ``steps`` trials each, first by ``spread`` of the ring."""
-        first = start_mm[:, :2].astype(np.float64).ravel() / self._radius_mm
-        found = minimize(
-            lambda x: self._loss(self._guides(x)),
-            first,
-            method="Nelder-Mead",
-            options={
-                "maxfev": steps * len(start_mm),
-                "xatol": TOLERANCE,
-                "fatol": TOLERANCE * self._loss(self._guides(first)),
-                "initial_simplex": np.vstack([first, first + spread * np.eye(len(first))]),
-            },
-        )
-        return self._with(self._guides(found.x))
-
-    def _guides(self, x: np.ndarray) -> np.ndarray:
-        return np.c_[x.reshape(-1, 2), np.zeros(len(x) // 2)].astype(np.float32) * np.float32(self._radius_mm)
-
-    def _candidate_loss(self, chosen: tuple[int, ...]) -> float:
-        visible = np.stack([self._visible[k] for k in chosen], axis=1)
-        return self._fitted_loss(self._candidates[list(chosen)], visible)
-
-    def _loss(self, guides_mm: np.ndarray) -> float:
-        visible = np.ones((len(self._probe), len(guides_mm)), bool)
-        for k, guide in enumerate(guides_mm):
-            visible[self._at_risk, k] = self._probe.visible(guide, self._at_risk)
-        return self._fitted_loss(guides_mm, visible)
-
-    def _fitted_loss(self, guides_mm: np.ndarray, visible: np.ndarray) -> float:
-        return self._probe.loss(self._with(guides_mm), self._base, visible)
-
-    def _with(self, guides_mm: np.ndarray) -> Hypothesis:
-        guides = tuple(tuple(float(c) for c in guide) for guide in guides_mm)
-        return replace(self._base.hypothesis, guides_mm=guides, shadows=True)
+    def __str__(self) -> str:
+        guides = ", ".join(f"({x:.2f}, {y:.2f}, {z:.2f})" for x, y, z in self.guides_mm)
+        return f"{self.name} (guides at {guides} mm)"

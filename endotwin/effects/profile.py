@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from endotwin.effects.effect import Effect, parameter
-from endotwin.guides import EXPONENTIAL
 
 
 @dataclass(frozen=True)
@@ -18,5 +17,4 @@ class Profile(Effect):
     """
 
     name: ClassVar[str] = "profile"
-    kind: ClassVar[str] = "light"
-    exponential: float = parameter(EXPONENTIAL, 0.0, 1.0, "1")
+    exponential: float = parameter(1.0, 0.0, 1.0)

@@ -22,7 +22,7 @@ class RollingShutter(ExposureEffect):
     """
 
     name: ClassVar[str] = "rolling_shutter"
-    readout: float = parameter(0.8, 0.0, 1.0, "frame")
+    readout: float = parameter(0.8, 0.0, 1.0)
 
     def timed(self, shot: Shot) -> Shot:
         return replace(shot, readout=self.readout)

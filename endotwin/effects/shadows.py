@@ -16,4 +16,3 @@ class Shadows(Effect):
     """
 
     name: ClassVar[str] = "shadows"
-    kind: ClassVar[str] = "light"

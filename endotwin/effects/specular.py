@@ -13,4 +13,3 @@ class Specular(Effect):
     """The GGX lobe of each vertex's roughness with the surface's f0 (see ``shading.specular``)."""
 
     name: ClassVar[str] = "specular"
-    kind: ClassVar[str] = "surface"

@@ -21,9 +21,8 @@ class Vignetting(Effect):
     """
 
     name: ClassVar[str] = "vignetting"
-    kind: ClassVar[str] = "optics"
-    k2: float = parameter(0.0, -5.0, 1.0, "1")
-    k4: float = parameter(0.0, -5.0, 5.0, "1")
+    k2: float = parameter(0.0, -5.0, 1.0)
+    k4: float = parameter(0.0, -5.0, 5.0)
 
     def transmission(self, camera: Camera, pixel: np.ndarray) -> np.ndarray:
         """V of row-major pixels [N], float32 [N]."""

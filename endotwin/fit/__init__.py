@@ -6,8 +6,11 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from endotwin.config import METHODS, STANDARD, FitConfig
+from endotwin.effects import RENDERED
 from endotwin.errors import OptionError
-from endotwin.fit.pace import Pace
+from endotwin.pixels.pace import Pace
+from endotwin.pixels.samples import Views
+from endotwin.surface.casting import Caster
 from endotwin.twin import Twin
 
 
@@ -19,6 +22,7 @@ def fit(
     progress: Callable[[str, int, int], None] | None = None,
     checkpoint: Path | None = None,
     effects: Mapping[str, str] | None = None,
+    price: Callable[[Twin, Caster, Views], Twin] = lambda twin, caster, views: twin,
 ) -> Twin:
     """The twin with materials, light and response fitted to its training photos.
 
@@ -29,13 +33,21 @@ def fit(
         progress: called with (label, done, total).
         checkpoint: where ``endopbr`` keeps what it has learned so far, to go on from there if it is stopped.
         effects: auto, on or off by name of the effect, ``twin`` only; auto unless named.
+        price: gives the fitted twin's decisions what each effect costs a rendering of the training views,
+            ``twin`` only.
 
     Raises:
-        OptionError: an unknown method, or an option that the method does not have.
+        OptionError: an unknown method, an option that the method does not have, or an effect that is only
+            rendered.
         SequenceError: the photos cannot be read, or show nothing of the surface.
     """
     if config.method not in METHODS:
         raise OptionError(f"unknown method '{config.method}'; choose one of: {', '.join(METHODS)}")
+    rendered = [name for name, state in (effects or {}).items() if name in RENDERED and state == "on"]
+    if rendered:
+        raise OptionError(
+            f"{rendered[0]} is rendered and not fitted; ask for it with 'synth --effects {rendered[0]}=on'"
+        )
     if config.method == "twin":
         if epochs is not None:
             raise OptionError(
@@ -43,7 +55,11 @@ def fit(
             )
         from endotwin.fit.solve import fit_twin
 
-        return fit_twin(twin, Pace(config, progress), seed, effects or {})
+        return fit_twin(twin, Pace(config, progress), seed, effects or {}, price)
+    if effects:
+        raise OptionError(
+            "--effects belongs to --method twin; endopbr is Han & Wu's model as published, without effects"
+        )
     from endotwin.fit.endopbr import fit_endopbr
 
     return fit_endopbr(twin, config.budget, epochs, seed, progress, checkpoint)

@@ -14,7 +14,7 @@ import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 
-from endotwin.output import whole_file
+from endotwin.run.output import whole_file
 from endotwin.twin import Twin
 
 EVERY_S = 60.0

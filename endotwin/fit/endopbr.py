@@ -18,19 +18,23 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from endotwin import shading
 from endotwin.errors import SequenceError
 from endotwin.fit.checkpoint import Checkpoint, identity
-from endotwin.fit.start import ALBEDO_TOP
-from endotwin.hashgrid import corner_slots
-from endotwin.incidence import COS_MIN, unit
+from endotwin.fit.hashgrid import corner_slots
+from endotwin.light import shading
+from endotwin.light.forward import Lit, Lobes, radiance
+from endotwin.light.incidence import COS_MIN
+from endotwin.pixels.start import ALBEDO_TOP
+from endotwin.run.stopwatch import Stopwatch
 from endotwin.sequence import Frame
-from endotwin.stopwatch import Stopwatch
+from endotwin.surface.vectors import unit
 from endotwin.twin import Light, Materials, Response, Twin
 
 LEVELS, FEATURES, LOG2_SLOTS = 16, 2, 19
 COARSEST_CELLS, FINEST_CELLS = 16, 2048
 """Cells along the scene's longest side at the first and the last level (Müller et al. 2022, table 1)."""
+
+LOBES = Lobes(shading.F0_DIELECTRIC, burley=False)
 
 MARGIN = 0.01
 """The grid reaches this part of the scene's longest side beyond the surface."""
@@ -228,10 +232,10 @@ def _predict(
         torch.from_numpy(pixels[name]) for name in ("cos", "sin2", "log_cos_axis", "log_distance")
     )
     log_L0, log_n, log_q, log_gamma = shared.logs
-    strength = torch.exp(shading.log_spotlight(log_L0, log_n.exp(), log_q.exp(), log_cos_axis, log_distance))
-    shine = shading.F0_DIELECTRIC * shading.specular_colocated(cos, sin2, roughness)
-    reflected = shading.diffuse(base_color, metallic) + shine[:, None]
-    return shading.respond(reflected * (strength * cos * (2 * math.pi))[:, None], log_gamma.exp())
+    lit = Lit.at_lens(cos, sin2, log_cos_axis, log_distance)
+    diffuse = base_color * (1 - metallic)[:, None]
+    x = radiance(lit, (log_L0, log_n.exp(), log_q.exp()), diffuse, roughness, LOBES)
+    return shading.respond(x, log_gamma.exp())
 
 
 def _baked(field: Field, shared: SharedParameters, twin: Twin) -> tuple[Materials, Light]:

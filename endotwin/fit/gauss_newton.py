@@ -18,12 +18,12 @@ import scipy.linalg
 import torch
 from torch import Tensor
 
+from endotwin.fit.hashgrid import HashOperator
 from endotwin.fit.model import Globals, at_pixels, predict
-from endotwin.fit.normal import CHANNELS, MeshPattern, NormalEquations, assemble, robust_cost
-from endotwin.fit.samples import Samples, drawn
-from endotwin.fit.start import PRIOR
-from endotwin.hashgrid import HashOperator
-from endotwin.shading import F0_DIELECTRIC
+from endotwin.fit.normal_equations import CHANNELS, MeshPattern, NormalEquations, assemble, robust_cost
+from endotwin.light.shading import F0_DIELECTRIC
+from endotwin.pixels.samples import Samples, drawn
+from endotwin.pixels.start import LIGHT_MEAN, LIGHT_SPREAD, PRIOR
 
 NOISE_MIN = 1 / 255
 """Least noise assumed, in display values: 8-bit rounding and a step of sensor noise."""
@@ -39,23 +39,24 @@ COLOR_SPREAD = 0.5
 ROUGHNESS_SPREAD = 0.1
 """Standard deviation of a table entry of a COARSE_MM cell: base colour, roughness."""
 
-ROUGHNESS_MEAN = 0.4
 COARSE_MM = 12.0
 
-GLOBAL_MEAN = (
-    0.0,
-    PRIOR["gamma"] * PRIOR["n"],
-    PRIOR["gamma"] * PRIOR["q"],
-    PRIOR["gamma"],
-    math.log(F0_DIELECTRIC),
-    0.0,
-)
-GLOBAL_SPREAD = (5.0, 0.5, 0.25, 0.1, 0.5, 0.5)
+GLOBAL_MEAN = (0.0, *LIGHT_MEAN, math.log(F0_DIELECTRIC), 0.0)
+GLOBAL_SPREAD = (5.0, *LIGHT_SPREAD, 0.5, 0.5)
 GLOBAL_RANGE = ((-20.0, 20.0), (0.0, 10.0), (0.0, 4.0), (0.15, 1.5), (-6.0, -0.7), (-1.5, 1.5))
 """Prior and bounds of the shared parameters, in the order of BOUNCE_GLOBALS."""
 
+USUAL_SIGMAS = 3.0
+AT_EDGE = 0.01
+"""Beyond so many standard deviations of the prior, and so near an edge of their range in shares of one, n, q
+and γ are no endoscope's."""
+
 DARKEST_LOG_SCALE = -1.2
 """With albedos scaled by less than e to this the brightest tissue would reflect a quarter of the light."""
+
+BRIGHTEST = 0.9
+"""Share of the light that the brightest tissue may reflect: a mesh that lacks what throws light on it asks
+for more, until the tissue would be a furnace."""
 
 COLOR_RANGE = (1e-3, 2.0)
 
@@ -82,6 +83,11 @@ class State:
     def raw(self) -> Tensor:
         """θ = θ̄ + A·table, [V, 4]."""
         return self.mean if self.operator is None else self.mean + self.operator(self.table)
+
+    @property
+    def textured(self) -> bool:
+        """Whether places may differ in their materials: before the first step they do not."""
+        return self.mean.dim() == 2 or bool(self.table.any())
 
     @property
     def materials(self) -> Tensor:
@@ -320,15 +326,38 @@ def global_prior(unit_mm: float, count: int) -> tuple[Tensor, Tensor]:
     return mean, spread
 
 
-def at_bounds(shared: Globals) -> list[str]:
-    """Which of n, q and gamma lie on an edge of their range."""
-    told = {"n": 1, "q": 2, "gamma": 3}
-    return [name for name, index in told.items() if float(shared.vector[index]) in GLOBAL_RANGE[index]]
+def unusual(shared: Globals) -> list[str]:
+    """Those of n, q and γ, with what is usual, that lie more than USUAL_SIGMAS of the prior from its mean, or
+    at an edge of their range."""
+    _, n, q = shared.log_light
+    found = []
+    for index, name, value in ((1, "n", n), (2, "q", q), (3, "γ", shared.gamma)):
+        scale = 1.0 if name == "γ" else PRIOR["gamma"]
+        mean, spread = GLOBAL_MEAN[index] / scale, GLOBAL_SPREAD[index] / scale
+        low, high = max(0.0, mean - USUAL_SIGMAS * spread), mean + USUAL_SIGMAS * spread
+        from_edge = min(abs(float(shared.vector[index]) - edge) for edge in GLOBAL_RANGE[index])
+        at_edge = from_edge < AT_EDGE * GLOBAL_SPREAD[index]
+        if at_edge or not low <= value <= high:
+            edge = "the edge of what is tried, " if at_edge else ""
+            found.append(f"{name} {value:.3f} ({edge}usually {low:.3f} to {high:.3f})")
+    return found
 
 
 def darkest(shared: Globals) -> bool:
     """Whether light between tissue asks for darker tissue than there is."""
     return shared.log_scale <= DARKEST_LOG_SCALE
+
+
+def without_furnace(state: State) -> State:
+    """``state`` with the albedo's scale such that the brightest tissue (98th percentile) reflects at most
+    BRIGHTEST."""
+    brightest = float(np.percentile(state.materials[:, :3].amax(dim=1).numpy(), 98))
+    limit = math.log(BRIGHTEST / brightest)
+    if state.shared.log_scale <= limit:
+        return state
+    vector = state.shared.vector.clone()
+    vector[-1] = limit
+    return replace(state, shared=replace(state.shared, vector=vector))
 
 
 def bounded(shared: Globals, vector: Tensor) -> Globals:

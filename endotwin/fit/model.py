@@ -1,23 +1,18 @@
-"""The forward model of a training pixel and its derivatives, for least squares.
-
-A pixel's radiance is linear in its base colour, x = Σ_k g_k·(D_k·b/π + f0·S_k) + 2·E·(b + ρ), with g =
-2π·L·(n·ω) of each light guide, D the diffuse factor, S the specular lobe E what other tissue throws on it
-and ρ the lobe's share of that; the photo shows C = x^γ
-(Han & Wu 2025 with one guide at the lens and no E; Burley's diffuse lobe).
-"""
+"""What a training pixel shows, C = x^γ of its radiance x (``light.forward``), and the derivatives for least
+squares."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
-from endotwin import shading
-from endotwin.effects.coat import F0_WATER, Coat
-from endotwin.fit.samples import Samples
+from endotwin.effects.coat import Coat
+from endotwin.light import forward, shading
+from endotwin.light.forward import Lobes
+from endotwin.pixels.samples import Samples
 from endotwin.twin import Light, Response
 
 GLOBALS = ("gamma·ln L0", "gamma·n", "gamma·q", "gamma", "ln f0")
@@ -65,6 +60,11 @@ class Globals:
     def f0(self) -> float:
         return math.exp(self.vector[4]) if self.specular else 0.0
 
+    @property
+    def lobes(self) -> Lobes:
+        coat = None if self.coat is None else (self.coat.weight, self.coat.roughness)
+        return Lobes(self.f0, coat=coat)
+
     def without_scale(self) -> Globals:
         """The same without interreflection."""
         return replace(self, vector=self.vector[: len(GLOBALS)])
@@ -81,80 +81,10 @@ def at_pixels(samples: Samples, triangles: Tensor, per_vertex: Tensor) -> Tensor
     return torch.einsum("nk,nkc->nc", samples.barycentric, corners)
 
 
-@dataclass(frozen=True)
-class _Lit:
-    """What one guide does at N pixels: x = per_color·b + shine + weight·film; each [N], like its ln of cone
-    and distance."""
-
-    per_color: Tensor
-    shine: Tensor | None
-    film: Tensor | None
-    log_axis: Tensor
-    log_distance: Tensor
-
-
-def _guides(samples: Samples, roughness: Tensor, shared: Globals) -> list[_Lit]:
-    """Each guide's light on the samples; the light at the lens is a case of its own, and cheaper."""
-    exposure = 0.0 if samples.log_exposure is None else samples.log_exposure
-    if samples.guides is None:
-        log_strength = shading.log_spotlight(*shared.log_light, samples.log_cos_axis, samples.log_distance)
-        strength = torch.exp(log_strength + exposure) * samples.cos * (2 * math.pi)
-        one = torch.ones_like(samples.cos)
-        per_color = strength * shading.burley(samples.cos, samples.cos, one, roughness) / math.pi
-
-        def lobe(roughness: Tensor) -> Tensor:
-            return strength * shading.specular_colocated(samples.cos, samples.sin2, roughness)
-
-        shine, film = _lobes(lobe, roughness, shared)
-        return [_Lit(per_color, shine, film, samples.log_cos_axis, samples.log_distance)]
-    guides, found = samples.guides, []
-    count = guides.cos_i.shape[1]
-    for k in range(count):
-        cos_i, log_axis, log_distance = (
-            value[:, k] for value in (guides.cos_i, guides.log_axis, guides.log_distance)
-        )
-        log_strength = shading.log_spotlight(*shared.log_light, log_axis, log_distance)
-        strength = torch.exp(log_strength + exposure) * cos_i * (2 * math.pi / count)
-        per_color = strength * shading.burley(cos_i, samples.cos, guides.cos_d[:, k], roughness) / math.pi
-
-        def lobe(roughness: Tensor, k=k, cos_i=cos_i, strength=strength) -> Tensor:
-            return strength * shading.specular_lobe(cos_i, samples.cos, guides.sin2_m[:, k], roughness)
-
-        shine, film = _lobes(lobe, roughness, shared)
-        found.append(_Lit(per_color, shine, film, log_axis, log_distance))
-    return found
-
-
-def _lobes(
-    lobe: Callable[[Tensor], Tensor], roughness: Tensor, shared: Globals
-) -> tuple[Tensor | None, Tensor | None]:
-    """The tissue's highlight, and that of a coat of weight 1; None where there is none."""
-    shine = shared.f0 * lobe(roughness) if shared.specular else None
-    if shared.coat is None:
-        return shine, None
-    return shine, F0_WATER * lobe(torch.full_like(roughness, shared.coat.roughness).detach())
-
-
-def _bounced(samples: Samples, shared: Globals) -> Tensor:
-    """2·E of the samples, [N, 3]."""
-    bounce, (log_L0, n, q) = samples.bounce, shared.log_light
-    log_factor = log_L0 + n * bounce.by_n + q * bounce.by_q + shared.log_scale * bounce.by_scale
-    if samples.log_exposure is not None:
-        log_factor = log_factor + samples.log_exposure
-    return 2 * torch.exp(bounce.log + log_factor[:, None])
-
-
 def radiance(samples: Samples, material: Tensor, shared: Globals) -> Tensor:
     """Radiance x [N, 3] of the samples with ``material``: base colour and roughness at the pixels, [N, 4]."""
-    lit = _guides(samples, material[:, 3], shared)
-    x = sum(guide.per_color for guide in lit)[:, None] * material[:, :3]
-    if shared.specular:
-        x = x + sum(guide.shine for guide in lit)[:, None]
-    if shared.coat is not None:
-        x = x + shared.coat.weight * sum(guide.film for guide in lit)[:, None]
-    if samples.bounce is None:
-        return x
-    return x + _bounced(samples, shared) * (material[:, :3] + samples.bounce.gloss[:, None])
+    lit = samples.lit(*shared.log_light[1:], shared.log_scale)
+    return forward.radiance(lit, shared.log_light, material[:, :3], material[:, 3], shared.lobes)
 
 
 def predict(samples: Samples, material: Tensor, shared: Globals) -> Tensor:
@@ -191,28 +121,31 @@ def linearise(samples: Samples, material: Tensor, shared: Globals) -> Linearised
     """The model and its derivatives at ``material`` [N, 4]; those by roughness come from automatic
     differentiation.
     """
+    lobes, log_light = shared.lobes, shared.log_light
+    lit = samples.lit(*log_light[1:], shared.log_scale)
     roughness = material[:, 3].detach().requires_grad_()
     with torch.enable_grad():
-        lit = _guides(samples, roughness, shared)
-        per_color = sum(guide.per_color for guide in lit)
-        shine = sum(guide.shine for guide in lit) if shared.specular else torch.zeros_like(per_color)
+        shares = forward.shares(lit, log_light, roughness, lobes)
+        per_color = sum(share.per_color for share in shares)
+        shine = sum(share.shine for share in shares) if shared.specular else torch.zeros_like(per_color)
         color_slope = torch.autograd.grad(per_color.sum(), roughness, retain_graph=True)[0]
         shine_slope = 0 * color_slope
         if shared.specular:
             shine_slope = torch.autograd.grad(shine.sum(), roughness)[0]
     base_color, per_color, shine = material[:, :3].detach(), per_color.detach()[:, None], shine.detach()
-    x = per_color * base_color + shine[:, None]
-    film = None if shared.coat is None else sum(guide.film for guide in lit).detach()[:, None]
-    if film is not None:
-        x = x + shared.coat.weight * film
-    axis, distance = _moments(lit, base_color, shared)
+    x = axis = distance = 0.0
+    for share in shares:
+        given = share.radiance(base_color, lobes).detach()
+        x, axis = x + given, axis + given * share.log_axis[:, None]
+        distance = distance + given * share.log_distance[:, None]
+    coat = None if lobes.coat is None else sum(share.coat for share in shares).detach()[:, None]
     if samples.bounce is not None:
-        bounced = _bounced(samples, shared)
-        glow = bounced * (base_color + samples.bounce.gloss[:, None])
+        bounced = forward.bounced(lit, log_light)
+        glow = bounced * (base_color + lit.gloss[:, None])
         x, per_color = x + glow, per_color + bounced
         axis = axis + glow * samples.bounce.by_n[:, None]
         distance = distance - glow * samples.bounce.by_q[:, None]
-    gamma, (log_L0, n, q) = shared.gamma, shared.log_light
+    gamma, (log_L0, n, q) = shared.gamma, log_light
     log_x = torch.log(x + shading.RADIANCE_MIN)
     power = torch.exp(gamma * log_x)
     slope = gamma * power / (x + shading.RADIANCE_MIN)
@@ -230,18 +163,5 @@ def linearise(samples: Samples, material: Tensor, shared: Globals) -> Linearised
         by_color=by_color,
         by_roughness=slope * (color_slope[:, None] * base_color + shine_slope[:, None]),
         by_globals=torch.stack(by_globals, dim=-1),
-        by_coat=None if film is None else slope * film,
+        by_coat=None if coat is None else slope * coat,
     )
-
-
-def _moments(lit: list[_Lit], base_color: Tensor, shared: Globals) -> tuple[Tensor, Tensor]:
-    """Σ_k x_k·(ln cone)_k and Σ_k x_k·(ln d)_k, [N, 3] each."""
-    axis = distance = 0.0
-    for guide in lit:
-        x = guide.per_color.detach()[:, None] * base_color
-        if guide.shine is not None:
-            x = x + guide.shine.detach()[:, None]
-        if guide.film is not None:
-            x = x + shared.coat.weight * guide.film.detach()[:, None]
-        axis, distance = axis + x * guide.log_axis[:, None], distance + x * guide.log_distance[:, None]
-    return axis, distance

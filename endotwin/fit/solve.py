@@ -9,40 +9,42 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 
-from endotwin.casting import Caster
 from endotwin.effects import Decision, Effects
-from endotwin.effects.decide import decide
-from endotwin.effects.price import priced
 from endotwin.errors import SequenceError
-from endotwin.fit.film import judged as judged_coat
+from endotwin.evidence.coat import judged as judged_coat
+from endotwin.evidence.decide import decide
 from endotwin.fit.gauss_newton import (
-    ROUGHNESS_MEAN,
     GaussNewton,
     State,
-    at_bounds,
     darkest,
     roughness_to_raw,
+    unusual,
+    without_furnace,
 )
+from endotwin.fit.hashgrid import HashGrid, HashOperator
 from endotwin.fit.lighting import Relighting, lit
 from endotwin.fit.model import Globals, at_pixels
-from endotwin.fit.pace import ITERATIONS, LIGHT, Pace
-from endotwin.fit.samples import THREADS, Samples, drawn, gather
-from endotwin.fit.start import ALBEDO_TOP, BRIGHT, Start, closed_form, start_at
 from endotwin.fit.tilt import tilted
-from endotwin.fit.unit import unit_mm
 from endotwin.fit.within import Within
-from endotwin.hashgrid import HashGrid, HashOperator
-from endotwin.shading import F0_DIELECTRIC
+from endotwin.light.shading import F0_DIELECTRIC, ROUGHNESS_TISSUE
+from endotwin.pixels.length_unit import unit_mm
+from endotwin.pixels.pace import ITERATIONS, LIGHT, Pace
+from endotwin.pixels.samples import Samples, Views, drawn, gather
+from endotwin.pixels.start import ALBEDO_TOP, BRIGHT, Start, closed_form, start_at
+from endotwin.run.threads import THREADS
 from endotwin.surface import Surface
+from endotwin.surface.casting import Caster
 from endotwin.twin import Light, Materials, Response, Twin
 
 logger = logging.getLogger("endotwin")
+
+Price = Callable[[Twin, Caster, Views], Twin]
 
 LIGHT_CELL_MM = 1.6
 LIGHT_COARSEST_MM = 12.0
@@ -91,9 +93,9 @@ class _Cost:
     pixels: int
 
 
-def fit_twin(twin: Twin, pace: Pace, seed: int, states: Mapping[str, str]) -> Twin:
+def fit_twin(twin: Twin, pace: Pace, seed: int, states: Mapping[str, str], price: Price) -> Twin:
     """Fit as the module says, in the time that ``pace`` gives, with effects as ``states`` say (auto unless
-    named).
+    named), whose prices in its decisions are those that ``price`` finds.
 
     Raises:
         SequenceError: the training photos show nothing of the surface.
@@ -124,7 +126,7 @@ def fit_twin(twin: Twin, pace: Pace, seed: int, states: Mapping[str, str]) -> Tw
     with stopwatch.stage("effects"):
         caster = caster.threaded(THREADS)
         decided = decide(samples[every], twin, caster, states)
-        relighting = Relighting(twin, caster, decided.effects, np.unique(samples.frame.numpy()))
+        relighting = Relighting(surface, caster, decided.effects, samples.views)
         if decided.light is not None:
             start = start_at(
                 samples[telling],
@@ -133,7 +135,7 @@ def fit_twin(twin: Twin, pace: Pace, seed: int, states: Mapping[str, str]) -> Tw
                 decided.light,
                 decided.gamma,
             )
-        samples = lit(samples, twin, caster, decided.effects)
+        samples = lit(samples, surface, caster, relighting.effects)
     with stopwatch.stage("light"):
         wanted = states.get("coat", "auto") if "specular" in decided.effects else "off"
         count = min(LIGHT_PIXELS, int(LIGHT_SHARE * pace.start_pixels))
@@ -142,18 +144,18 @@ def fit_twin(twin: Twin, pace: Pace, seed: int, states: Mapping[str, str]) -> Tw
     with stopwatch.stage("detail"):
         state, normals = _find_detail(samples, twin, state, cost, pace, relighting)
         twin = replace(twin, surface=replace(surface, normals=normals))
-    stuck = at_bounds(state.shared)
-    if stuck:
+    odd = unusual(state.shared)
+    if odd:
         logger.warning(
-            "the fit ended at the bound of %s, as it does on wrong poses, depth or photos: do not trust it; "
-            "'endotwin check %s' looks for the cause",
-            *(" and ".join(stuck), twin.source.path),
+            "the fit ended at %s, as it does on wrong poses, depth or photos, or without an effect that they "
+            "show: do not trust it; 'endotwin check %s' looks for the cause",
+            *(" and ".join(odd), twin.source.path),
         )
     with stopwatch.stage("price"):
         decisions = {**decided.decisions, "coat": coat}
         if "interreflection" in decided.effects and not relighting.bounces:
             decisions["interreflection"] = _without_bounce(decisions["interreflection"])
-        fitted = priced(_fitted(twin, state, relighting.effects, decisions), caster)
+        fitted = price(_fitted(twin, state, relighting.effects, decisions), caster, samples.views)
     return fitted.with_record(
         fit={"method": "twin", "undetermined": list(start.undetermined), **stopwatch.to_dict()}
     )
@@ -186,7 +188,7 @@ def _find_light(
         out_of_time=pace.light_is_over,
     )
     shown = torch.from_numpy(start.base_color) ** start.response.gamma
-    mean = torch.cat([shown.median(dim=0).values, torch.tensor([roughness_to_raw(ROUGHNESS_MEAN)])])
+    mean = torch.cat([shown.median(dim=0).values, torch.tensor([roughness_to_raw(ROUGHNESS_TISSUE)])])
     table = torch.zeros(operator.forward_csr.shape[1], 4)
     effects = relighting.effects
     options = {"specular": "specular" in effects, "bounce": relighting.bounces}
@@ -196,20 +198,22 @@ def _find_light(
     ready = pace.stopwatch.total
     state, _ = solver.step(state, joint=False)
     step_s = pace.stopwatch.total - ready
-    steps = BOUNCE_STEPS if relighting.bounces else LIGHT_STEPS
-    judged = Decision("off", "no time to judge")
-    for number in range(steps):
+    number, steps = 0, BOUNCE_STEPS if relighting.bounces else LIGHT_STEPS
+    judged = None
+    while number < steps:
         late = pace.left(LIGHT) <= 2 * step_s
         if late and (relighting.bounces or number):
             break
-        if relighting.bounces and darkest(state.shared):
-            state = relighting.without_bounce(solver, state)
+        if relighting.bounces:
+            state = without_furnace(state)
+            if darkest(state.shared):
+                state, steps = relighting.without_bounce(solver, state), number + LIGHT_STEPS
         relighting(solver, state)
         within = Within.of(solver.samples, surface, unit)
         material = at_pixels(solver.samples, solver.triangles, state.materials)
         shared, noise = state.shared, solver.noise(state)
         if number == (0 if coat == "on" else COAT_STEP):
-            layer, judged = judged_coat(within, material, shared, noise, coat)
+            layer, judged = judged_coat(within.highlights(material, shared, noise), coat)
             shared = replace(shared, coat=layer)
         if relighting.bounces:
             solver.held = (*start.undetermined, "L0", *(("albedo scale",) * (number < HOLD_STEPS)))
@@ -219,10 +223,14 @@ def _find_light(
         if late:
             break
         state, gain = solver.step(state, joint=relighting.bounces)
-        pace.report("find the light", number + 1, steps)
+        number += 1
+        pace.report("find the light", number, steps)
         if gain < CONVERGED * solver.cost(state, solver.noise(state)):
-            break
-    return state, _Cost(ready - began, step_s, len(points) * len(operator.cells_mm), len(samples)), judged
+            number = max(number, COAT_STEP) if judged is None else steps
+    if relighting.bounces:
+        state = without_furnace(state)
+    cost = _Cost(ready - began, step_s, len(points) * len(operator.cells_mm), len(samples))
+    return state, cost, judged or Decision("off", "no time to judge")
 
 
 def _find_detail(
@@ -266,7 +274,7 @@ def _find_detail(
     for number in range(pace.plan.tilts):
         if pace.left(ITERATIONS) <= step_s / 2:
             break
-        normals = tilted(normals, solver, state, twin, relighting.effects)
+        normals = tilted(normals, solver, state, relighting.effects)
         pace.report("tilt the normals", number + 1, pace.plan.tilts)
     return state, normals
 

@@ -16,29 +16,27 @@ from torch import Tensor
 from endotwin.effects import Effects
 from endotwin.fit.gauss_newton import HUBER, TEMPER, GaussNewton, State, conjugate_gradients
 from endotwin.fit.model import at_pixels, predict
-from endotwin.fit.normal import CHUNK, MeshPattern, Residual, add_products, pairs_of
-from endotwin.fit.samples import Samples
-from endotwin.guides import guided
-from endotwin.incidence import COS_MIN, dot, unit
-from endotwin.twin import Twin
+from endotwin.fit.normal_equations import CHUNK, MeshPattern, Residual, add_products, pairs_of
+from endotwin.light.guides import guided
+from endotwin.light.incidence import COS_MIN
+from endotwin.pixels.samples import Samples
+from endotwin.surface.vectors import dot, unit
 
 SPREAD_DEG = 0.5
 """Standard deviation of a mesh normal's error, along each axis."""
 
-STEP = 2e-3
+TILT_STEP = 2e-3
 """Step of the finite differences, in radians."""
 
 AXIS_PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 
 
-def tilted(
-    normals: np.ndarray, solver: GaussNewton, state: State, twin: Twin, effects: Effects
-) -> np.ndarray:
+def tilted(normals: np.ndarray, solver: GaussNewton, state: State, effects: Effects) -> np.ndarray:
     """The unit ``normals`` [V, 3] of the vertices, tilted to what the samples of ``solver`` show."""
     samples, pattern = solver.samples, solver.pattern
     noise = solver.noise(state)
     scale = 1 / (noise**2 * TEMPER)
-    sums, right = _assembled(normals, samples, pattern, solver.triangles, state, twin, effects, HUBER * noise)
+    sums, right = _assembled(normals, samples, pattern, solver.triangles, state, effects, HUBER * noise)
     blocks = {pair: pattern.matrix(sums[:, :, k] * scale) for k, pair in enumerate(AXIS_PAIRS)}
     blocks |= {(j, i): block for (i, j), block in blocks.items()}
     precision = 1 / np.radians(SPREAD_DEG) ** 2
@@ -61,7 +59,6 @@ def _assembled(
     pattern: MeshPattern,
     triangles: Tensor,
     state: State,
-    twin: Twin,
     effects: Effects,
     width: float,
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -72,11 +69,10 @@ def _assembled(
     """
     count = len(pattern.corners)
     sums, right = np.zeros((count, 6, 6), np.float32), np.zeros((count, 3, 3), np.float32)
-    rotations = twin.source.open().T_world_camera[:, :3, :3].astype(np.float32)
-    rays = twin.camera.pixel_directions.reshape(-1, 3)
+    rotations = samples.views.T_local_camera[:, :3, :3].astype(np.float32)
     materials, corner_normals = state.materials, torch.from_numpy(normals)
     for start, part in zip(range(0, len(samples), CHUNK), samples.chunks(CHUNK), strict=True):
-        rotation, view = rotations[part.frame.numpy()], rays[part.pixel.numpy()]
+        rotation, view = rotations[part.views.row(part.frame)], part.directions
         normal = at_pixels(part, triangles, corner_normals).numpy()
         normal = unit(np.einsum("na,nab->nb", normal, rotation))
         material = at_pixels(part, triangles, materials)
@@ -86,8 +82,8 @@ def _assembled(
         axes = [towards] if part.guides is None else [towards, np.cross(normal, towards)]
         slopes = []
         for axis in axes:
-            seen = _seen(part, unit(normal + np.float32(STEP) * axis), view, effects)
-            slopes.append((predict(seen, material, state.shared) - predicted) / STEP)
+            seen = _seen(part, unit(normal + np.float32(TILT_STEP) * axis), view, effects)
+            slopes.append((predict(seen, material, state.shared) - predicted) / TILT_STEP)
         axis, slope = _steepest(axes, slopes)
         residual = Residual.of(part, predicted, width)
         weight = (residual.weight * slope * slope).sum(dim=1).numpy()
@@ -107,9 +103,8 @@ def _seen(samples: Samples, normal: np.ndarray, view: np.ndarray, effects: Effec
     tangential = normal + cos[:, None] * view
     guides = samples.guides
     if guides is not None:
-        points_mm = view * samples.log_distance.exp().numpy()[:, None]
         visible = (guides.cos_i > 0).numpy()
-        guides = guided(points_mm, normal, np.asarray(effects.guides_mm), effects.profile, visible)
+        guides = guided(samples.points_mm, normal, np.asarray(effects.guides_mm), effects.profile, visible)
     return replace(
         samples,
         cos=torch.from_numpy(np.maximum(cos, COS_MIN)),

@@ -8,6 +8,7 @@ beside smooth albedo features, no texture can pass for shading, whatever those f
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,12 +16,14 @@ import scipy.linalg
 import torch
 from torch import Tensor
 
-from endotwin import shading
-from endotwin.fit.fixed_effects import Design, regress
+from endotwin.effects.coat import Coat
+from endotwin.evidence.coat import LEAST_SIGHTINGS, Highlights
 from endotwin.fit.gauss_newton import TEMPER, bounded, free_directions, global_prior
-from endotwin.fit.model import Globals, linearise
-from endotwin.fit.samples import Samples
-from endotwin.fit.start import BRIGHT, DIFFUSE_SIN2
+from endotwin.fit.model import GLOBALS, Globals, linearise
+from endotwin.light import shading
+from endotwin.pixels.fixed_effects import Design, regress
+from endotwin.pixels.samples import Samples
+from endotwin.pixels.start import BRIGHT, DIFFUSE_SIN2
 from endotwin.surface import Surface
 
 DARKEST = 0.03
@@ -32,8 +35,11 @@ MODEL_ERROR = 0.02
 COAT_SPREAD = 2.0
 """Standard deviation of a coat's weight about 0: tissue is wet, not lacquered."""
 
-LEAST_SIGHTINGS = 16
-ROUNDS = 4
+HIGHLIGHT_PIXELS = 30_000
+"""Of the highlights, all of some vertices; more would not change the mind about a coat."""
+
+F0 = GLOBALS.index("ln f0")
+REWEIGHTS = 4
 
 
 @dataclass(frozen=True)
@@ -85,6 +91,21 @@ class Within:
             return shared
         return self._step(material, shared, ("level", "n", "q", "gamma"), torch.ones_like(diffuse), noise)
 
+    def highlights(self, material: Tensor, shared: Globals, noise: float) -> Callable[[float], Highlights]:
+        """Sightings near the mirror direction, by the roughness of a coat of weight 0 over them.
+
+        Args:
+            material: [N, 4] at the samples. noise: of a pixel, in display values.
+        """
+        shiny = self.samples.sin2 < DIFFUSE_SIN2
+        shiny &= torch.from_numpy(self.vertex % max(1, int(shiny.sum()) // HIGHLIGHT_PIXELS) == 0)
+
+        def under(roughness: float) -> Highlights:
+            seen = self.sightings(material, replace(shared, coat=Coat(0.0, roughness)), shiny, noise)
+            return Highlights(seen.vertex, seen.residual, seen.slopes[:, F0], seen.by_coat)
+
+        return under
+
     def _step(
         self, material: Tensor, shared: Globals, held: tuple[str, ...], chosen: Tensor, noise: float
     ) -> Globals:
@@ -102,7 +123,7 @@ class Within:
             precision = scipy.linalg.block_diag(precision, TEMPER / COAT_SPREAD**2)
             pull = np.r_[pull, -TEMPER * shared.coat.weight / COAT_SPREAD**2]
         design = Design(columns, seen.vertex, self.count, weight=seen.weight, prior=(precision, pull))
-        found = regress(seen.residual, design, rounds=ROUNDS).coefficients
+        found = regress(seen.residual, design, rounds=REWEIGHTS).coefficients
         along = free @ found[: free.shape[1]]
         length = min(1.0, float((spread / np.maximum(np.abs(along), 1e-12)).min()))
         if coated:

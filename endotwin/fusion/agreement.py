@@ -8,9 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from endotwin.cameras import Camera
-from endotwin.casting import Caster
-from endotwin.fusion.views import View, ahead
+from endotwin.fusion.views import View
+from endotwin.run.ahead import ahead
 from endotwin.surface import Surface
+from endotwin.surface.casting import Caster
 
 
 @dataclass(frozen=True)

@@ -7,11 +7,13 @@ from collections.abc import Iterable
 import numpy as np
 
 from endotwin.cameras import Camera
-from endotwin.casting import Caster
 from endotwin.fusion.agreement import Tolerance
 from endotwin.fusion.refine import Sighting, sighting
-from endotwin.fusion.views import View, ahead
+from endotwin.fusion.views import View
+from endotwin.run.ahead import ahead
+from endotwin.run.threads import THREADS
 from endotwin.surface import Surface
+from endotwin.surface.casting import Caster
 
 CLEARANCE = 1e-3
 """A ray reaches a vertex when its first hit is no nearer than this part of the distance."""
@@ -20,7 +22,7 @@ CLEARANCE = 1e-3
 def covered(
     camera: Camera, surface: Surface, views: Iterable[View], lens_mask: np.ndarray, tolerance: Tolerance
 ) -> Surface:
-    """``surface`` with ``seen_by``, ``best_cosine`` and ``nearest_mm`` over ``views``.
+    """``surface`` with ``seen_by`` and ``nearest_mm`` over ``views``.
 
     A view sees a vertex that faces it, projects onto a lit pixel (``lens_mask`` [H, W]) and is not hidden:
     it is no farther than all pixels about it measured, up to the tolerance, or else than some of them, and
@@ -40,13 +42,11 @@ def covered(
 
     count = len(surface.vertices_mm)
     seen_by = np.zeros(count, np.int32)
-    best_cosine = np.zeros(count, np.float32)
     nearest_mm = np.full(count, np.inf, np.float32)
-    for seen in ahead(seen_in, views, threads=2):
+    for seen in ahead(seen_in, views, threads=THREADS):
         seen_by[seen.vertex] += 1
-        best_cosine[seen.vertex] = np.maximum(best_cosine[seen.vertex], seen.cosine)
         nearest_mm[seen.vertex] = np.minimum(nearest_mm[seen.vertex], seen.distance_mm)
-    return surface.with_coverage(seen_by, best_cosine, nearest_mm)
+    return surface.with_coverage(seen_by, nearest_mm)
 
 
 def about(distance_mm: np.ndarray, uv: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -13,13 +13,10 @@ from functools import lru_cache
 import numpy as np
 
 from endotwin.cameras import Camera, Pinhole
+from endotwin.sequence.sequence import one_surface
 
 SINGLE_FACE_TAN = 1.75
 """A field of view within ±60° about the axis fits one face; a wider one is split along a cube's sides."""
-
-JUMP = 0.02
-"""Relative step between neighbouring distances above which a face takes the nearest one and blends
-nothing."""
 
 
 @dataclass(frozen=True)
@@ -49,8 +46,7 @@ class Face:
         """Face z-depth float32 [h, w], 0 where there is none, from native distances along the ray [H, W]
         (NaN = none)."""
         near = distance_mm.reshape(-1)[self.corners]
-        low, high = near.min(axis=0), near.max(axis=0)
-        smooth = high - low <= JUMP * low
+        smooth = one_surface(near.min(axis=0), near.max(axis=0))
         value = np.where(smooth, np.einsum("kp,kp->p", self.weights, near), near[0])
         depth = np.zeros(self.width * self.height, np.float32)
         depth[self.pixel] = np.nan_to_num(value * self.depth_ratio)

@@ -9,13 +9,13 @@ import numpy as np
 import scipy.sparse
 from scipy.sparse.linalg import spsolve
 
-from endotwin.ahead import ahead
 from endotwin.cameras import Camera
 from endotwin.fusion.agreement import Tolerance
 from endotwin.fusion.coverage import about
 from endotwin.fusion.mesh import boundary_edges, surface_of
 from endotwin.fusion.smooth import neighbour_mean
 from endotwin.fusion.views import View
+from endotwin.run.ahead import ahead
 from endotwin.surface import Surface
 
 LONGEST_RIM_VOXELS = 30.0

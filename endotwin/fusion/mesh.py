@@ -33,7 +33,6 @@ def surface_of(
         triangles=triangles.astype(np.int32),
         normals=normals[used],
         seen_by=np.zeros(count, np.int32),
-        best_cosine=np.zeros(count, np.float32),
         nearest_mm=np.full(count, np.inf, np.float32),
         filled=np.zeros(count, bool) if filled is None else filled[used],
     )

@@ -9,10 +9,10 @@ import cv2
 import numpy as np
 
 from endotwin.cameras import Camera
-from endotwin.casting import Caster
 from endotwin.fusion.agreement import Comparison
 from endotwin.fusion.mesh import boundary_edges, proper
 from endotwin.fusion.refine import LEAST_COSINE
+from endotwin.surface.casting import Caster
 
 LEAST_CROWD = 3
 """A pixel that sees through is patched when this many of the nine there lack a surface; fewer is noise."""

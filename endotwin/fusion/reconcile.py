@@ -7,13 +7,13 @@ from collections.abc import Iterable
 import numpy as np
 
 from endotwin.cameras import Camera
-from endotwin.casting import Caster
 from endotwin.fusion.agreement import Tolerance, compare
 from endotwin.fusion.carve import Votes
 from endotwin.fusion.mesh import single, surface_of
 from endotwin.fusion.patch import Patches
 from endotwin.fusion.views import View
 from endotwin.surface import Surface
+from endotwin.surface.casting import Caster
 
 
 def reconciled(

@@ -10,12 +10,14 @@ import numpy as np
 
 from endotwin.cameras import Camera
 from endotwin.fusion.mesh import vertex_normals
-from endotwin.fusion.views import View, ahead
+from endotwin.fusion.views import View
+from endotwin.run.ahead import ahead
+from endotwin.run.threads import THREADS
 from endotwin.surface import Surface
 
 LEAST_COSINE = 0.2
 """Views more grazing than 78° do not move a vertex: along the normal their pixels say little."""
-JUMP = 0.05
+INTERPOLATED_STEP = 0.05
 """Relative step between neighbouring distances above which nothing is interpolated."""
 
 
@@ -75,7 +77,7 @@ def refined(camera: Camera, surface: Surface, views: Iterable[View], reach_mm: f
 
     weight_sum = np.zeros(len(surface.vertices_mm))
     offset_sum = np.zeros_like(weight_sum)
-    for vertex, offset_mm, weight in ahead(offsets, views, threads=2):
+    for vertex, offset_mm, weight in ahead(offsets, views, threads=THREADS):
         weight_sum[vertex] += weight
         offset_sum[vertex] += weight * offset_mm
     move_mm = (offset_sum / np.where(weight_sum > 0, weight_sum, 1)).astype(np.float32)
@@ -95,5 +97,5 @@ def interpolated(distance_mm: np.ndarray, uv: np.ndarray) -> np.ndarray:
     value = (1 - b) * ((1 - a) * d00 + a * d01) + b * ((1 - a) * d10 + a * d11)
     step = np.maximum(np.maximum(np.abs(d00 - d11), np.abs(d01 - d10)), np.abs(d00 - d01))
     with np.errstate(invalid="ignore"):
-        value[~(step <= JUMP * value)] = np.nan
+        value[~(step <= INTERPOLATED_STEP * value)] = np.nan
     return value

@@ -9,8 +9,8 @@ import scipy.sparse
 import trimesh
 
 from endotwin.fusion.mesh import surface_of
-from endotwin.incidence import unit
 from endotwin.surface import Surface
+from endotwin.surface.vectors import unit
 
 CRUMPLED_DEG = 1.5
 """Angle between a vertex's normal and its neighbours' mean, in the median, that only noise gives: clean depth

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from endotwin.ahead import ahead
 from endotwin.fusion.faces import distance_mm
+from endotwin.run.ahead import ahead
 from endotwin.sequence import Sequence
 
 logger = logging.getLogger("endotwin")

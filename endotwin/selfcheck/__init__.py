@@ -7,7 +7,7 @@ import warnings
 from collections.abc import Callable, Iterator
 from importlib import import_module
 
-from endotwin.processes import Pool
+from endotwin.run.processes import Pool
 from endotwin.selfcheck.finding import Finding
 
 __all__ = ["GROUPS", "Finding", "run_checks"]

@@ -13,7 +13,7 @@ import mpmath
 import numpy as np
 import torch
 
-from endotwin import shading
+from endotwin.light import shading
 from endotwin.selfcheck.finding import Check, Finding
 
 DIGITS = 40

@@ -13,9 +13,9 @@ import torch
 
 from endotwin.config import FitConfig
 from endotwin.evaluation import evaluate
-from endotwin.fit.samples import Samples
-from endotwin.fit.start import PRIOR, closed_form
 from endotwin.pipeline import fit_twin, fuse_twin
+from endotwin.pixels.samples import Samples
+from endotwin.pixels.start import PRIOR, closed_form
 from endotwin.selfcheck.finding import Check, Finding
 from endotwin.selfcheck.tube import Tube, flight
 from endotwin.twin import Twin

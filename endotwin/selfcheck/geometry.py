@@ -8,12 +8,12 @@ from collections.abc import Iterator
 import numpy as np
 import trimesh
 
-from endotwin.casting import Caster
 from endotwin.fusion.mesh import surface_of
 from endotwin.selfcheck.finding import Check, Finding
 from endotwin.selfcheck.journey import Journey, travel
 from endotwin.selfcheck.tube import Tube
 from endotwin.surface import Surface
+from endotwin.surface.casting import Caster
 
 RADIUS_MM = 15.0
 RAYS = 1_000_000

@@ -39,7 +39,7 @@ class Journey:
         twin = self.twin
         surface, light = twin.surface, twin.light
         constants = [light.L0, light.n, light.q, twin.response.gamma, twin.materials.f0]
-        arrays = [surface.vertices_mm, surface.normals, surface.best_cosine, surface.origin_mm]
+        arrays = [surface.vertices_mm, surface.normals, surface.origin_mm]
         arrays += [*twin.materials.per_vertex.values(), np.array(constants)]
         return sum(int((~np.isfinite(array)).sum()) for array in arrays)
 

@@ -1,14 +1,14 @@
 """Rendered datasets: trajectories through a twin, variation of it, and labelled frames."""
 
-from endotwin.synth.dataset import Summary, make_job, render_dataset, synthesize
-from endotwin.synth.edits import Edit, parse_light_edit, parse_material_edit
 from endotwin.synth.job import Job
 from endotwin.synth.labels import DEFAULT_LABELS, LABELS, parse_labels
 from endotwin.synth.layouts import LAYOUTS
-from endotwin.synth.screening import Limits
-from endotwin.synth.switches import equipped
+from endotwin.synth.run.dataset import Summary, make_job, render_dataset, synthesize
 from endotwin.synth.trajectories import Trajectory, parse_trajectory
+from endotwin.synth.trajectories.screening import Limits
 from endotwin.synth.variation import Variation, fixed, read_variation
+from endotwin.synth.variation.edits import Edit, parse_light_edit, parse_material_edit
+from endotwin.synth.variation.switches import equipped
 
 __all__ = [
     "DEFAULT_LABELS",

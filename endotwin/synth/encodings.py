@@ -11,7 +11,7 @@ import numpy as np
 import OpenEXR
 import tifffile
 
-from endotwin.readers.c3vd import DEPTH_RANGE_MM
+from endotwin.sequence.readers.c3vd import DEPTH_RANGE_MM
 
 FLOW_RANGE_PX = 20.0
 UINT16 = 65535

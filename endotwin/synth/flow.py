@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from endotwin.cameras import Camera
-from endotwin.casting import Caster, Correspondences
-from endotwin.surface import Surface
+from endotwin.surface.casting import Caster, Correspondences
 
 HIDDEN_MM = 1e-3
 HIDDEN = 1e-4
@@ -16,12 +15,6 @@ BEHIND_MM = 0.01
 """How far behind a hit the ray goes on that looks for surface hidden by it."""
 
 OCCLUSION_RANGE_MM = 100.0
-
-
-def surface_points(surface: Surface, hits: Correspondences) -> np.ndarray:
-    """World points of hits, float64 [N, 3], mm."""
-    corners = surface.vertices_mm[surface.triangles[hits.triangle]].astype(np.float64)
-    return np.einsum("nk,nka->na", hits.barycentric.astype(np.float64), corners) + surface.origin_mm
 
 
 def flow_to(points: np.ndarray, pixel: np.ndarray, camera: Camera, T_world_other: np.ndarray) -> np.ndarray:

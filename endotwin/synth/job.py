@@ -10,9 +10,9 @@ from importlib.metadata import version
 import numpy as np
 
 from endotwin.cameras import Camera
-from endotwin.synth.regions import Region
 from endotwin.synth.trajectories import Trajectory
 from endotwin.synth.variation import Draw
+from endotwin.synth.variation.regions import Region
 from endotwin.twin import Twin
 
 LIBRARIES = ("endotwin", "numpy", "torch", "embreex", "opencv-contrib-python-headless", "openexr", "tifffile")

@@ -7,13 +7,15 @@ from functools import cached_property
 
 import numpy as np
 
-from endotwin.casting import Caster, Correspondences
 from endotwin.effects.exposure import following
 from endotwin.errors import OptionError
-from endotwin.incidence import to_camera
-from endotwin.render import Renderer, View, laid_out
+from endotwin.light.incidence import to_camera
+from endotwin.render import Renderer, View
+from endotwin.render.renderer import laid_out
+from endotwin.run.streams import Stream
 from endotwin.surface import Surface
-from endotwin.synth.flow import flow_to, hides_surface, seen_from, surface_points
+from endotwin.surface.casting import Caster, Correspondences, surface_points
+from endotwin.synth.flow import flow_to, hides_surface, seen_from
 from endotwin.synth.job import Job
 from endotwin.synth.photograph import photographed
 
@@ -48,9 +50,6 @@ DEFAULT_LABELS = ("rgb", "depth", "normals", "mask")
 PHOTOS = {"rgb", "rgb_linear", "rgb_exr"}
 SHADED = PHOTOS | {"diffuse", "albedo", "roughness", "metallic"}
 """Labels that need a photo, and those that need the frame's draw at all."""
-
-SENSOR = 2
-"""Stream of the random numbers of each frame's sensor."""
 
 
 def parse_labels(text: str) -> tuple[str, ...]:
@@ -95,7 +94,7 @@ class Labeller:
             renderer, specular_free = self._renderers(index)
         if PHOTOS & set(job.labels):
             view = renderer.view(T_world_camera)
-            generator = np.random.default_rng([job.document["seed"], SENSOR, index])
+            generator = Stream.SENSOR.generator(job.document["seed"], index)
             color, radiance = photographed(
                 renderer, view, T_world_camera, self._T_world_next[index], generator
             )

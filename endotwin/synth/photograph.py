@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from endotwin import shading
 from endotwin.effects import RENDERED
 from endotwin.effects.exposure import Shot, expose
+from endotwin.light import shading
 from endotwin.render import Renderer, View
 
 EXPOSURE = ("motion_blur", "rolling_shutter")

@@ -11,16 +11,16 @@ from pathlib import Path
 
 import numpy as np
 
-from endotwin.casting import Caster
 from endotwin.effects import FITTED, RENDERED, Decision
 from endotwin.effects.exposure import following
-from endotwin.effects.price import best_ms, frame_ms
 from endotwin.errors import OptionError
-from endotwin.output import TWIN
 from endotwin.render import Renderer
+from endotwin.render.price import best_ms, frame_ms
+from endotwin.run.output import TWIN
 from endotwin.sequence import Sequence
+from endotwin.surface.casting import Caster
 from endotwin.synth.photograph import photographed
-from endotwin.synth.switches import equipped
+from endotwin.synth.variation.switches import equipped
 from endotwin.tradeoff.ladder import Rung, rung
 from endotwin.tradeoff.measure import due, keep, kept, measured, timed
 from endotwin.tradeoff.summary import summary
@@ -122,7 +122,9 @@ def _measure(
     if rendered_too:
         for name, milliseconds in rendered_ms(twin).items():
             found[name]["render_ms"] = milliseconds
-    keep({**asked, **measurement, "effects": found, "frame_ms": frame_ms(Renderer(twin))}, result)
+    poses = twin.sequence().T_world_camera
+    pose = poses[len(poses) // 2]
+    keep({**asked, **measurement, "effects": found, "frame_ms": frame_ms(Renderer(twin), pose)}, result)
 
 
 def rendered_ms(twin: Twin) -> dict[str, float]:

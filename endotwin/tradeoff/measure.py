@@ -14,7 +14,7 @@ from pathlib import Path
 
 from endotwin.config import to_yaml
 from endotwin.errors import EndotwinError
-from endotwin.output import whole_file
+from endotwin.run.output import whole_file
 from endotwin.tradeoff.ladder import Rung
 
 SCORES = ("psnr", "ssim", "lpips", "psnr_covered", "covered")

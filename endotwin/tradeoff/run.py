@@ -10,9 +10,9 @@ from collections.abc import Callable
 from pathlib import Path
 
 from endotwin.errors import OutputError
-from endotwin.output import TRADEOFF, check_free, move_folder, unwritable
-from endotwin.readers import open_sequence
+from endotwin.run.output import TRADEOFF, check_free, move_folder, unwritable
 from endotwin.sequence import Sequence
+from endotwin.sequence.readers import open_sequence
 from endotwin.tradeoff import crops, effects, plot, report
 from endotwin.tradeoff.ladder import Rung
 from endotwin.tradeoff.measure import due, keep, measured

@@ -9,8 +9,8 @@ import torch
 
 from endotwin.cameras import CALIBRATIONS, Fisheye, Pinhole
 from endotwin.effects.chromatic import Chromatic
-from endotwin.images import read_color
-from endotwin.readers import open_sequence
+from endotwin.sequence.images import read_color
+from endotwin.sequence.readers import open_sequence
 
 CAMERAS = {
     "pinhole": Pinhole(120, 90, 80.0, 80.0, 55.0, 47.0, k1=-0.1),

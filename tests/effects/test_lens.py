@@ -8,7 +8,7 @@ import torch
 
 from endotwin.cameras import CALIBRATIONS, Fisheye, Pinhole
 from endotwin.effects.lens import WHOLE_FIELD_DEG, Lens
-from endotwin.readers import open_sequence
+from endotwin.sequence.readers import open_sequence
 
 PINHOLE = Pinhole(160, 120, 70.0, 70.0, 82.0, 57.0)
 FISHEYE = Fisheye(160, 120, 60.0, 60.0, 82.0, 57.0)
@@ -78,5 +78,6 @@ def test_a_distorted_camera_with_full_photos_has_no_stop(tmp_path):
 
 
 def test_the_circle_of_c3vd_s_lens_is_one_angle(data_root):
-    lens, agreement = Lens.measured(open_sequence(data_root / "colon_fisheye"))
+    sequence = open_sequence(data_root / "colon_fisheye")
+    lens, agreement = Lens.measured(sequence.camera, sequence.lens_mask)
     assert lens.half_angle_deg == pytest.approx(56.3, abs=0.1) and agreement > 0.999

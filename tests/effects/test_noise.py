@@ -9,7 +9,7 @@ import torch
 from scipy import stats
 
 from endotwin.effects.noise import LEVEL, Noise
-from endotwin.readers import open_sequence
+from endotwin.sequence.readers import open_sequence
 
 SHAPE = (480, 640)
 EVERYWHERE = np.ones(SHAPE, bool)

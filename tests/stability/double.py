@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 import torch
 
-from endotwin import hashgrid
-from endotwin.fit import gauss_newton, normal, solve, start, tilt
-from endotwin.fit.samples import Samples
+from endotwin.fit import gauss_newton, hashgrid, solve, tilt
+from endotwin.fit import normal_equations as normal
+from endotwin.pixels import start
+from endotwin.pixels.samples import Samples
 
 MODULES = (hashgrid, gauss_newton, normal, solve, start, tilt)
 

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 import torch
 
-from endotwin import shading
-from endotwin.casting import Correspondences
 from endotwin.fit.gauss_newton import COLOR_RANGE, State
 from endotwin.fit.model import Globals
-from endotwin.incidence import COS_MIN, DISTANCE_MIN_MM, incidence_on
+from endotwin.light import shading
+from endotwin.light.incidence import COS_MIN, DISTANCE_MIN_MM, incidence_on
+from endotwin.surface.casting import Correspondences
 from endotwin.twin import Light, Response
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from endotwin.poses import write_c3vd_poses
+from endotwin.sequence.poses import write_c3vd_poses
 from endotwin.synth.job import Job
 from endotwin.synth.layouts.layout import CAMERA_WORDS, Layout, frame_name, write_camera, write_lines
 

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from endotwin.cameras import Pinhole
-from endotwin.readers.simcol import DEPTH_FULL, DEPTH_RANGE_MM, MIRROR_Y, MM_PER_CM
+from endotwin.sequence.readers.simcol import DEPTH_FULL, DEPTH_RANGE_MM, MIRROR_Y, MM_PER_CM
 from endotwin.synth.encodings import depth_png
 from endotwin.synth.job import Job
 from endotwin.synth.layouts.layout import (

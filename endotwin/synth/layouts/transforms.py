@@ -6,7 +6,7 @@ import json
 from pathlib import Path
 
 from endotwin.cameras import Camera, Fisheye, Pinhole
-from endotwin.poses import AXES_OPENGL_OPENCV, MM_PER_UNIT
+from endotwin.sequence.poses import AXES_OPENGL_OPENCV, MM_PER_UNIT
 from endotwin.synth.encodings import depth_png
 from endotwin.synth.job import Job
 from endotwin.synth.layouts.layout import Layout, frame_name, needs

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from endotwin.cameras import Pinhole
-from endotwin.poses import MM_PER_UNIT
+from endotwin.sequence.poses import MM_PER_UNIT
 from endotwin.synth.encodings import depth_png
 from endotwin.synth.job import Job
 from endotwin.synth.layouts.layout import CAMERA_WORDS, Layout, needs, numbers, write_camera, write_lines

@@ -1,0 +1,305 @@
+"""How well a twin predicts the photos that its fit never saw.
+
+The held-out frames are rendered at their own poses and compared with their photos, both display-encoded in
+[0, 1]. Three kinds of pixels:
+
+- *valid*: inside the lens circle and with a measured depth. Where the twin shows no surface it is black, and
+  that counts.
+- *covered*: valid, and the vertices of the triangle that the pixel's ray hits were each seen by a training
+  photo. The rest of a held-out frame shows what no training photo showed. The definition is by surface: where
+  the mesh is wrong, so that a ray ends on another part of the colon that was seen, the error counts.
+- all others are ignored.
+
+Where the camera changes its gain, that of a held-out frame is one number that no other photo tells. It is
+read from the frame's own photo, as the median of photo over twin, and kept with the scores.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from endotwin.errors import TwinError
+from endotwin.evaluation import metrics
+from endotwin.light import shading
+from endotwin.render import Renderer
+from endotwin.run.output import check_picture
+from endotwin.sequence import Frame
+from endotwin.sequence.images import write_png
+from endotwin.surface import Surface
+from endotwin.surface.casting import Correspondences
+from endotwin.twin import Light, Twin, as_twin
+
+logger = logging.getLogger("endotwin")
+
+Progress = Callable[[str, int, int], None]
+
+SHEET_WIDTH = 320
+"""Width in pixels of one picture of the contact sheet."""
+
+MID_TONES = (0.1, 0.9)
+"""Display values that are neither noise nor clipped."""
+
+POOR_DB = 20.0
+"""A twin with a lower PSNR does not look like its photos."""
+
+ERROR_FULL_SCALE = 0.25
+"""Absolute display-value error that the contact sheet draws in its brightest colour."""
+
+
+@dataclass(frozen=True)
+class FrameScore:
+    """Scores of one held-out frame; NaN where there is nothing to measure.
+
+    Attributes:
+        index, name: which frame.
+        gain: factor on the twin's radiance that its photo shows; 1 where the camera keeps its gain.
+        psnr, ssim, lpips: over its valid pixels.
+        psnr_covered, ssim_covered, lpips_covered: over its covered pixels.
+        covered: fraction of the valid pixels that are covered.
+    """
+
+    index: int
+    name: str
+    gain: float
+    psnr: float
+    ssim: float
+    lpips: float
+    psnr_covered: float
+    ssim_covered: float
+    lpips_covered: float
+    covered: float
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Scores of a twin on its held-out frames; a mean score is the mean of the frames' scores.
+
+    Attributes:
+        frames: one score a held-out frame. gamma, light: what the fit found. geometry: the twin's protocol.
+    """
+
+    frames: tuple[FrameScore, ...]
+    gamma: float
+    light: Light
+    geometry: str
+
+    def mean(self, score: str) -> float:
+        """Mean of a score, such as ``psnr_covered``, over the frames that have it; NaN where none has."""
+        values = [value for frame in self.frames if math.isfinite(value := getattr(frame, score))]
+        return float(np.mean(values)) if values else math.nan
+
+    @property
+    def psnr(self) -> float:
+        """Mean PSNR in dB over valid pixels."""
+        return self.mean("psnr")
+
+    @property
+    def ssim(self) -> float:
+        """Mean SSIM over valid pixels."""
+        return self.mean("ssim")
+
+    @property
+    def lpips(self) -> float:
+        """Mean LPIPS over valid pixels; NaN where the extra is not installed."""
+        return self.mean("lpips")
+
+    @property
+    def psnr_covered(self) -> float:
+        """Mean PSNR in dB over covered pixels."""
+        return self.mean("psnr_covered")
+
+    @property
+    def covered(self) -> float:
+        """Mean fraction of valid pixels that some training photo saw."""
+        return self.mean("covered")
+
+    def to_dict(self) -> dict:
+        """The scores as plain values; what could not be measured is None."""
+
+        def plain(value):
+            return None if isinstance(value, float) and not math.isfinite(value) else value
+
+        means = ("psnr", "ssim", "lpips", "psnr_covered", "covered")
+        return {
+            **{name: plain(self.mean(name)) for name in means},
+            "gamma": self.gamma,
+            "light": asdict(self.light),
+            "frames": [
+                {name: plain(value) for name, value in asdict(frame).items()} for frame in self.frames
+            ],
+        }
+
+    def __str__(self) -> str:
+        told = {"index", "name"} | ({"gain"} if all(frame.gain == 1 for frame in self.frames) else set())
+        scores = [field.name for field in fields(FrameScore) if field.name not in told]
+        rows = [["frame", *scores]]
+        for frame in self.frames:
+            rows.append([frame.name, *(_shown(name, getattr(frame, name)) for name in scores)])
+        rows.append(["mean", *(_shown(name, self.mean(name)) for name in scores)])
+        widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+        lines = ["  ".join(map(str.rjust, row, widths)) for row in rows]
+        light = f"L0 {self.light.L0:.4g}, n {self.light.n:.3f}, q {self.light.q:.3f}"
+        lines.append(f"{light}; γ {self.gamma:.4f}; geometry {self.geometry}")
+        return "\n".join(lines)
+
+
+def _shown(score: str, value: float) -> str:
+    if score.startswith("lpips") and not metrics.lpips_installed():
+        return "not installed"
+    if not math.isfinite(value):
+        return "-"
+    return f"{value:.2f}" if score.startswith("psnr") else f"{value:.4f}"
+
+
+def covered_pixels(hits: Correspondences, surface: Surface, shape: tuple[int, int]) -> np.ndarray:
+    """Bool [H, W]: pixels whose hit triangle has only vertices that a training photo saw."""
+    seen_triangle = (surface.seen_by > 0)[surface.triangles].all(axis=1)
+    covered = np.zeros(shape[0] * shape[1], bool)
+    covered[hits.pixel] = seen_triangle[hits.triangle]
+    return covered.reshape(shape)
+
+
+def gain_of(photo: np.ndarray, radiance: np.ndarray, gamma: float) -> float:
+    """Factor on ``radiance`` [..., 3] that makes it look like ``photo`` (display-encoded, of its shape).
+
+    The median of their ratio over mid-tones, which highlights and shadows' edges do not move; 1 where there
+    are none.
+    """
+    tells = (photo > MID_TONES[0]) & (photo < MID_TONES[1]) & (radiance > 0)
+    ratio = shading.radiance_of(photo[tells], gamma) / radiance[tells]
+    return float(np.median(ratio)) if ratio.size else 1.0
+
+
+@dataclass(frozen=True)
+class _HeldOut:
+    """A held-out frame beside its rendering.
+
+    Attributes:
+        photo, render: float32 [H, W, 3], display-encoded, in [0, 1]. gain: factor on the radiance that was
+            rendered. valid, covered: bool [H, W].
+    """
+
+    frame: Frame
+    photo: np.ndarray
+    render: np.ndarray
+    gain: float
+    valid: np.ndarray
+    covered: np.ndarray
+
+
+def _held_out(twin: Twin, progress: Progress | None) -> Iterator[_HeldOut]:
+    """Each held-out frame with a valid pixel, rendered; the others are skipped with a warning."""
+    renderer = Renderer(twin)
+    sequence = twin.sequence()
+    indices = twin.source.heldout(len(sequence))
+    for done, index in enumerate(indices):
+        if progress:
+            progress("held-out frames", done, len(indices))
+        frame = sequence.frame(index)
+        valid = sequence.lens_mask & np.isfinite(frame.depth_mm)
+        if not valid.any():
+            logger.warning("Held-out frame %s has no valid pixel and is not scored.", frame.name)
+            continue
+        photo = frame.color.astype(np.float32) / 255
+        view, gain = renderer.view(frame.T_world_camera, sequence.lens_mask), 1.0
+        if "gain" in twin.effects:
+            gain = gain_of(photo[valid], view.radiance[valid], twin.response.gamma)
+            view = renderer.view(frame.T_world_camera, sequence.lens_mask, gain)
+        covered = covered_pixels(view.hits, twin.surface, valid.shape)
+        yield _HeldOut(frame, photo, view.color, gain, valid, covered)
+    if progress:
+        progress("held-out frames", len(indices), len(indices))
+
+
+def _score(held_out: _HeldOut) -> FrameScore:
+    photo, render, valid, covered = held_out.photo, held_out.render, held_out.valid, held_out.covered
+    similarity = metrics.ssim_map(photo, render, valid)
+    distance = np.full(valid.shape, np.nan)
+    if metrics.lpips_installed():
+        distance = metrics.lpips_map(photo, render, valid)
+    return FrameScore(
+        index=held_out.frame.index,
+        name=held_out.frame.name,
+        gain=held_out.gain,
+        psnr=metrics.psnr(photo, render, valid),
+        ssim=metrics.masked_mean(similarity, valid),
+        lpips=metrics.masked_mean(distance, valid),
+        psnr_covered=metrics.psnr(photo, render, covered),
+        ssim_covered=metrics.masked_mean(similarity, covered),
+        lpips_covered=metrics.masked_mean(distance, covered),
+        covered=float(covered.sum() / valid.sum()),
+    )
+
+
+def evaluate(
+    twin: Twin | Path | str,
+    sheet: Path | None = None,
+    progress: Progress | None = None,
+    overwrite: bool = False,
+) -> Evaluation:
+    """Score a fitted twin on the frames that were held out of its fit.
+
+    Args:
+        twin: or its folder.
+        sheet: PNG file to write a contact sheet to, one row photo | render | error a frame.
+        progress: called with (label, done, total).
+        overwrite: whether ``sheet`` may exist.
+
+    Raises:
+        TwinError: the twin is not fitted, or no held-out frame has a valid pixel.
+        SequenceError: the twin's sequence has moved.
+        OutputError: ``sheet`` exists or cannot be written.
+    """
+    twin = as_twin(twin)
+    if sheet is not None:
+        check_picture(sheet, overwrite)
+    scores, rows = [], []
+    for held_out in _held_out(twin, progress):
+        scores.append(_score(held_out))
+        if sheet is not None:
+            rows.append(_sheet_row(held_out, scores[-1]))
+    if not scores:
+        raise TwinError(
+            f"{twin.source.path} has no held-out frame to score; fuse a sequence of two or more frames"
+        )
+    if sheet is not None:
+        write_png(Path(sheet), np.vstack(rows), overwrite)
+    evaluation = Evaluation(tuple(scores), twin.response.gamma, twin.light, twin.source.geometry)
+    if evaluation.psnr < POOR_DB:
+        logger.warning(
+            "the twin does not look like its photos (%.1f dB); 'endotwin check %s' looks for the cause",
+            *(evaluation.psnr, twin.source.path),
+        )
+    return evaluation
+
+
+def _sheet_row(held_out: _HeldOut, score: FrameScore) -> np.ndarray:
+    """Photo, render and error side by side, uint8 [h, 3·SHEET_WIDTH, 3], RGB."""
+    error = np.abs(held_out.photo - held_out.render).mean(axis=-1) / ERROR_FULL_SCALE * held_out.valid
+    heat = cv2.applyColorMap(_eight_bit(error), cv2.COLORMAP_INFERNO)
+    pictures = {
+        f"photo {held_out.frame.name}": held_out.frame.color,
+        f"render, {score.psnr:.1f} dB": _eight_bit(held_out.render),
+        f"error, 0 to {ERROR_FULL_SCALE:g}": cv2.cvtColor(heat, cv2.COLOR_BGR2RGB),
+    }
+    return np.hstack([_labelled(picture, label) for label, picture in pictures.items()])
+
+
+def _eight_bit(values: np.ndarray) -> np.ndarray:
+    return np.uint8(np.clip(values, 0, 1) * 255 + 0.5)
+
+
+def _labelled(picture: np.ndarray, label: str) -> np.ndarray:
+    height = round(SHEET_WIDTH * picture.shape[0] / picture.shape[1])
+    small = cv2.resize(picture, (SHEET_WIDTH, height), interpolation=cv2.INTER_AREA)
+    for offset, color in ((1, (0, 0, 0)), (0, (255, 255, 255))):
+        corner = (6 + offset, height - 8 + offset)
+        cv2.putText(small, label, corner, cv2.FONT_HERSHEY_SIMPLEX, 0.42, color, 1, cv2.LINE_AA)
+    return small

@@ -1,0 +1,264 @@
+"""Which of the fitted effects a scene calls for: sets of effects, compared on pixels that chose none of their
+coefficients.
+
+One effect can pass for another: a gain of each frame swallows most of a bounce that is left out, a vignetting
+a guide. So where the light stands, whether it bounces and whether the camera's gain changes are decided
+together: of all combinations the one that predicts best, less what is not worth its place beside the rest.
+Profile and vignetting, which say little, follow beside what was kept.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
+from functools import cache
+from itertools import combinations
+
+import numpy as np
+
+from endotwin.effects import Decision, Effect, Effects
+from endotwin.effects.gain import Gain
+from endotwin.effects.interreflection import Interreflection
+from endotwin.effects.offset import Offset
+from endotwin.effects.profile import Profile
+from endotwin.effects.shadows import Shadows
+from endotwin.effects.specular import Specular
+from endotwin.effects.vignetting import Vignetting
+from endotwin.evidence.bounce import bounced, cell_mm
+from endotwin.evidence.guide_search import Guides, Search, found_guides
+from endotwin.evidence.probe import MIN_IMPOSSIBLE_DB, Bounced, Fitted, Hypothesis, Probe, Verdict
+from endotwin.light.guides import AT_LENS, COSINE, EXPONENTIAL
+from endotwin.pixels.samples import Samples
+from endotwin.pixels.start import PRIOR
+from endotwin.surface.casting import Caster
+from endotwin.twin import Light, Twin
+
+TOGETHER = ("offset", "interreflection", "gain")
+BESIDE = ("profile", "vignetting")
+
+LEAST_GAIN = 0.08
+"""Standard deviation of ln gain below which, beside bounced light, it is none: the bounce from a mesh of what
+was seen errs by some 4 % of a whole frame's brightness. An automatic gain changes it by tens."""
+
+LEAST_VIGNETTING = Verdict(0.02, 3.0)
+"""What vignetting has to gain: exponent and profile of the light say nearly the same, so that it can gain
+little; wrongly on, it is fitted to none."""
+
+
+@dataclass(frozen=True)
+class Decided:
+    """The model of light that a scene calls for.
+
+    Attributes:
+        effects: those that are on, with parameters. decisions: of every fitted effect, by name.
+        light: where the fit starts instead of at the closed form, which is right for a light at the lens
+            alone; None where that is what it is, L0 = 0 where nothing tells its strength. gamma: the
+            response to start with.
+    """
+
+    effects: Effects
+    decisions: dict[str, Decision]
+    light: Light | None
+    gamma: float
+
+
+def decide(samples: Samples, twin: Twin, caster: Caster, wanted: Mapping[str, str]) -> Decided:
+    """Decide the effects of the light from ``samples`` that tell it.
+
+    Args:
+        wanted: auto, on or off by name of the effect; auto unless given.
+    """
+    probe = Probe(samples, twin, caster)
+    trial = _Trial(probe, wanted)
+    kept = trial.together()
+    kept = trial.shadowed(kept)
+    for name in BESIDE:
+        kept = trial.beside(name, kept)
+    return trial.decided(kept)
+
+
+class _Trial:
+    """Sets of effects about one probe, and what was decided of each effect."""
+
+    def __init__(self, probe: Probe, wanted: Mapping[str, str]):
+        self._probe, self._wanted = probe, wanted
+        self._decisions: dict[str, Decision] = {}
+        self._seconds = dict.fromkeys((*TOGETHER, *BESIDE), 0.0)
+        self._model, self._bouncing = cache(self._fitted), cache(self._bounced)
+        self._guides_mm = AT_LENS
+
+    def wanted(self, name: str) -> str:
+        return self._wanted.get(name, "auto")
+
+    def together(self) -> Fitted:
+        """What remains of the best set of the effects that are decided together."""
+        lens = self._sets(("interreflection", "gain"))
+        best = self._best(lens)
+        if self.wanted("offset") != "off" and len(self._probe):
+            began = time.perf_counter()
+            base = replace(self._model(best).hypothesis, vignetting=self.wanted("vignetting") != "off")
+            self._guides_mm = found_guides(self._probe, base, self.wanted("offset") == "on")
+            self._seconds["offset"] += time.perf_counter() - began
+        sets = self._sets(TOGETHER) if self._guides_mm != AT_LENS else lens
+        kept, verdicts = self._pruned(self._best(sets))
+        for name in TOGETHER:
+            self._say(name, name in kept, verdicts.get(name) or self._beside_kept(name, kept))
+        return self._model(kept)
+
+    def shadowed(self, kept: Fitted) -> Fitted:
+        """``kept``, whose guides cast shadows, or the same without them if no held-out pixel shows any."""
+        if kept.hypothesis.guides_mm == AT_LENS:
+            reason = "light at the lens casts no shadow that the lens sees"
+            self._decisions["shadows"] = Decision("off", reason)
+            return kept
+        unshadowed = self._probe.fit(replace(kept.hypothesis, shadows=False))
+        verdict = self._probe.compare(unshadowed, kept)
+        on = self.wanted("shadows") == "on" or (self.wanted("shadows") == "auto" and verdict.keep)
+        self._say("shadows", on, verdict)
+        return kept if on else unshadowed
+
+    def beside(self, name: str, kept: Fitted) -> Fitted:
+        """``kept`` with profile or vignetting beside it, if it is worth that, and its guides moved to where
+        they then predict best."""
+        if self.wanted(name) == "off" or not self._tellable(name, kept):
+            self._say(name, False, None)
+            return kept
+        began = time.perf_counter()
+        other = self._mixed(kept) if name == "profile" else replace(kept.hypothesis, vignetting=True)
+        other = self._probe.fit(other)
+        verdict = self._probe.compare(kept, other)
+        worth = verdict.worth(LEAST_VIGNETTING) if name == "vignetting" else verdict.keep
+        on = self.wanted(name) == "on" or worth
+        if on and other.hypothesis.guides_mm != AT_LENS:
+            polished_mm = Search.of(self._probe, other.hypothesis).polished()
+            other = self._probe.fit(replace(other.hypothesis, guides_mm=polished_mm))
+        self._say(name, on, verdict)
+        self._seconds[name] += time.perf_counter() - began
+        return other if on else kept
+
+    def decided(self, kept: Fitted) -> Decided:
+        """The effects of ``kept``, each with the evidence for it or against it."""
+        on = self.wanted("specular") != "off"
+        reason = "part of the published material; its strength f0 is fitted" if on else "forced off"
+        self._decisions["specular"] = Decision("on" if on else "off", reason)
+        decisions = {
+            name: replace(decision, fit_s=round(self._seconds.get(name, 0.0), 3))
+            for name, decision in self._decisions.items()
+        }
+        effects = self._effects(kept)
+        if "interreflection" in effects:
+            light = Light(kept.hypothesis.bounced.L0, PRIOR["n"], PRIOR["q"])
+            return Decided(effects, decisions, light, PRIOR["gamma"])
+        plain = not set(effects) - {"specular"}
+        return Decided(effects, decisions, None if plain else Light(0.0, kept.n, kept.q), kept.gamma)
+
+    def _sets(self, names: Iterable[str]) -> list[frozenset[str]]:
+        """All sets of the effects ``names`` that are wanted, in which those that are forced are on."""
+        forced = frozenset(name for name in names if self.wanted(name) == "on")
+        free = [name for name in names if self.wanted(name) == "auto" and self._tellable(name, None)]
+        return [forced.union(some) for count in range(len(free) + 1) for some in combinations(free, count)]
+
+    def _fitted(self, names: frozenset[str]) -> Fitted:
+        began = time.perf_counter()
+        hypothesis = Hypothesis(gain="gain" in names)
+        if "offset" in names:
+            hypothesis = replace(hypothesis, guides_mm=self._guides_mm, shadows=True)
+        if "interreflection" in names:
+            hypothesis = replace(hypothesis, bounced=self._bouncing(hypothesis.guides_mm))
+        found = self._probe.fit(hypothesis)
+        for name in names:
+            self._seconds[name] += (time.perf_counter() - began) / len(names)
+        return found
+
+    def _bounced(self, guides_mm: Guides) -> Bounced:
+        hypothesis = Hypothesis(guides_mm=guides_mm, shadows=guides_mm != AT_LENS)
+        return bounced(self._probe, replace(hypothesis, gain=self.wanted("gain") != "off"))
+
+    def _best(self, sets: list[frozenset[str]]) -> frozenset[str]:
+        """The set that predicts held-out pixels best; what no endoscope has counts MIN_IMPOSSIBLE_DB less."""
+        plain = self._model(sets[0])
+
+        def score_db(names: frozenset[str]) -> float:
+            model = self._model(names)
+            gain_db = self._probe.compare(plain, model).gain_db
+            return gain_db if model.possible else gain_db - MIN_IMPOSSIBLE_DB
+
+        return max(sets, key=score_db)
+
+    def _pruned(self, names: frozenset[str]) -> tuple[frozenset[str], dict[str, Verdict]]:
+        """``names`` less what is not worth its place, the least worth first; and the verdicts on the rest."""
+        while True:
+            verdicts = {name: self._verdict(names - {name}, names) for name in names}
+            unworthy = [name for name in names if self.wanted(name) == "auto"]
+            unworthy = [name for name in unworthy if not self._worth(name, names, verdicts[name])]
+            if not unworthy:
+                return names, verdicts
+            names = names - {min(unworthy, key=lambda name: verdicts[name].gain_db)}
+
+    def _worth(self, name: str, names: frozenset[str], verdict: Verdict) -> bool:
+        if name == "gain" and "interreflection" in names:
+            return verdict.keep and float(self._model(names).log_gain.std()) >= LEAST_GAIN
+        return verdict.keep
+
+    def _verdict(self, without: frozenset[str], names: frozenset[str]) -> Verdict:
+        return self._probe.compare(self._model(without), self._model(names))
+
+    def _beside_kept(self, name: str, kept: frozenset[str]) -> Verdict | None:
+        """What an effect that is off would gain; None where that was not tried."""
+        tried = self.wanted(name) != "off" and self._tellable(name, None)
+        if not tried or (name == "offset" and self._guides_mm == AT_LENS):
+            return None
+        return self._verdict(kept, kept | {name})
+
+    def _tellable(self, name: str, kept: Fitted | None) -> bool:
+        """Exact arguments: what the photos of this scene could tell at all."""
+        if len(self._probe) == 0:
+            return False
+        if name == "vignetting":
+            return kept.hypothesis.guides_mm != AT_LENS
+        return name != "gain" or len(self._probe.frames) > 1
+
+    def _mixed(self, kept: Fitted) -> Hypothesis:
+        """Beside ``kept``, the profile at the foot of the parabola through the losses of three."""
+        profiles = (COSINE, (COSINE + EXPONENTIAL) / 2, EXPONENTIAL)
+        losses = [self._probe.loss(replace(kept.hypothesis, profile=p), kept) for p in profiles]
+        bend, slope, _ = np.polyfit(profiles, losses, 2)
+        foot = -slope / (2 * bend) if bend > 0 else profiles[int(np.argmin(losses))]
+        return replace(kept.hypothesis, profile=float(np.clip(foot, COSINE, EXPONENTIAL)))
+
+    def _say(self, name: str, on: bool, verdict: Verdict | None) -> None:
+        """Note what was decided, and why."""
+        gain_db = None if verdict is None else round(verdict.gain_db, 3)
+        if self.wanted(name) == "off":
+            reason = "forced off"
+        elif on:
+            forced = "forced on; " if self.wanted(name) == "on" else ""
+            reason = f"{forced}predicts held-out pixels better by {verdict}"
+        elif verdict is not None:
+            reason = f"does not predict held-out pixels better ({verdict})"
+        else:
+            reason = {
+                "offset": "no position of one to three guides predicts better",
+                "vignetting": "with the light at the lens its profile says the same of every pixel",
+                "gain": "a single frame has no other to be brighter than",
+            }.get(name, "the photos show too little")
+        self._decisions[name] = Decision("on" if on else "off", reason, gain_db)
+
+    def _effects(self, kept: Fitted) -> Effects:
+        hypothesis, probe = kept.hypothesis, self._probe
+        effects: list[Effect] = [Specular()] if self.wanted("specular") != "off" else []
+        if hypothesis.guides_mm != AT_LENS:
+            effects.append(Offset(hypothesis.guides_mm))
+        if hypothesis.shadows:
+            effects.append(Shadows())
+        if hypothesis.bounced is not None:
+            effects.append(Interreflection(cell_mm(probe.samples.log_distance.numpy())))
+        if self._decisions["profile"].state == "on":
+            effects.append(Profile(hypothesis.profile))
+        if hypothesis.gain:
+            log_gain = kept.log_gain - kept.log_gain.mean()
+            effects.append(Gain(tuple(map(int, probe.frames)), tuple(map(float, log_gain))))
+        if hypothesis.vignetting:
+            effects.append(Vignetting(k2=float(kept.effects.coefficients[3] / kept.gamma)))
+        return Effects(effects)

@@ -1,0 +1,139 @@
+"""Where the light guides stand: the positions about the lens that predict held-out pixels best."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from scipy.optimize import minimize
+
+from endotwin.evidence.probe import Hypothesis, Probe
+from endotwin.light.guides import AT_LENS
+
+Guides = tuple[tuple[float, float, float], ...]
+"""Positions in the camera frame, mm."""
+
+RING = 0.12
+"""Radius of the ring on which guides are first sought, as a share of the median viewing distance: a tip
+that sees the wall at 20 mm has its guides within some 4 mm."""
+
+RING_RADII = (0.5, 1.0)
+RING_POINTS = 8
+MOST_GUIDES = 3
+SEARCH_PIXELS = 8_000
+"""Guides are sought with so many pixels of the probe."""
+
+REFINE_STEPS, SPREAD = 90, 0.2
+POLISH_STEPS, POLISH_SPREAD = 30, 0.05
+TOLERANCE = 1e-3
+"""The search ends when positions move by less than this share of the ring's radius, and the loss by less."""
+
+
+def ring_mm(probe: Probe, share: float = 1.0) -> np.ndarray:
+    """Positions about the lens, float32 [RING_POINTS, 3]."""
+    radius_mm = share * RING * float(np.exp(np.median(probe.samples.log_distance.numpy())))
+    angle = 2 * np.pi * np.arange(RING_POINTS) / RING_POINTS
+    return (radius_mm * np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)).astype(np.float32)
+
+
+def found_guides(probe: Probe, base: Hypothesis, forced: bool) -> Guides:
+    """Positions of one to three guides that predict held-out pixels better than ``base``, camera frame; the
+    lens where none do.
+
+    A glance at unrefined positions tells whether a search is worth its time. With ``forced`` there is always
+    a position: that of the most guides, if none is worth it.
+    """
+    search = Search.of(probe, base)
+    if not forced and not search.hints():
+        return AT_LENS
+    plain, best, guides_mm = probe.fit(base), None, ()
+    for number in range(1, MOST_GUIDES + 1):
+        guides_mm = search.best(guides_mm)
+        found = probe.fit(replace(base, guides_mm=guides_mm, shadows=True))
+        last = forced and best is None and number == MOST_GUIDES
+        if last or probe.compare(best or plain, found).keep:
+            best = found
+    return AT_LENS if best is None else Search.of(probe, best.hypothesis).polished()
+
+
+class Search:
+    """Guide positions that predict a probe's pixels best, shadows included."""
+
+    def __init__(self, probe: Probe, base: Hypothesis):
+        self._probe, self._base = probe, probe.fit(base)
+        self._candidates = np.concatenate([ring_mm(probe, share) for share in RING_RADII])
+        seen = [probe.visible(guide) for guide in self._candidates]
+        self._at_risk = np.flatnonzero(~np.logical_and.reduce(seen))
+        self._radius_mm = float(np.abs(self._candidates).max())
+
+    @classmethod
+    def of(cls, probe: Probe, base: Hypothesis) -> Search:
+        """A search with some of the probe's pixels, beside the other effects of ``base``."""
+        part, rows = probe.part(SEARCH_PIXELS)
+        return cls(part, base if base.bounced is None else replace(base, bounced=base.bounced[rows]))
+
+    def hints(self) -> bool:
+        """Whether one guide, wherever it is best, or two or three about the lens predict better."""
+        alone = np.array(self.best(()))
+        about = [min(self._about(number), key=self._loss) for number in range(2, MOST_GUIDES + 1)]
+        models = [self._probe.fit(self._with(guides_mm)) for guides_mm in (alone, *about)]
+        return any(self._probe.compare(self._base, model).hints for model in models)
+
+    def best(self, fewer_mm: Guides) -> Guides:
+        """The best positions with one guide more than there are in ``fewer_mm``."""
+        known = np.array(fewer_mm, np.float32).reshape(-1, 3)
+        start_mm = min([*self._joined(known), *self._about(len(known) + 1)], key=self._loss)
+        for moved in range(len(known)):
+            others = np.delete(start_mm, moved, axis=0)
+            start_mm = min([start_mm, *self._joined(others)], key=self._loss)
+        return self._refined(start_mm, REFINE_STEPS, SPREAD)
+
+    def _about(self, number: int) -> list[np.ndarray]:
+        """``number`` guides about the lens, on one ring, evenly apart as nearly as its points allow."""
+        rings = self._candidates.reshape(len(RING_RADII), RING_POINTS, 3)
+        step = np.round(np.arange(number) * RING_POINTS / number).astype(int)
+        turns = range(RING_POINTS // 2 if number == 2 else RING_POINTS)
+        return [ring[(step + turn) % RING_POINTS] for ring in rings for turn in turns]
+
+    def _joined(self, known_mm: np.ndarray) -> list[np.ndarray]:
+        """``known_mm`` [K, 3] with each of the candidates, [K + 1, 3] each."""
+        return [np.vstack([known_mm, candidate]) for candidate in self._candidates]
+
+    def polished(self) -> Guides:
+        """The base's own guides, moved to where they predict best beside all that was kept since."""
+        return self._refined(np.asarray(self._base.hypothesis.guides_mm), POLISH_STEPS, POLISH_SPREAD)
+
+    def _refined(self, start_mm: np.ndarray, steps: int, spread: float) -> Guides:
+        """Guides moved from ``start_mm`` [K, 3] by ``steps`` trials each, first by ``spread`` of the ring."""
+        first = start_mm[:, :2].astype(np.float64).ravel() / self._radius_mm
+        found = minimize(
+            lambda x: self._loss(self._guides(x)),
+            first,
+            method="Nelder-Mead",
+            options={
+                "maxfev": steps * len(start_mm),
+                "xatol": TOLERANCE,
+                "fatol": TOLERANCE * self._loss(self._guides(first)),
+                "initial_simplex": np.vstack([first, first + spread * np.eye(len(first))]),
+            },
+        )
+        return _plain(self._guides(found.x))
+
+    def _guides(self, x: np.ndarray) -> np.ndarray:
+        return np.c_[x.reshape(-1, 2), np.zeros(len(x) // 2)].astype(np.float32) * np.float32(self._radius_mm)
+
+    def _loss(self, guides_mm: np.ndarray) -> float:
+        visible = np.ones((len(self._probe), len(guides_mm)), bool)
+        for k, guide in enumerate(guides_mm):
+            visible[self._at_risk, k] = self._probe.visible(guide, self._at_risk)
+        return self._fitted_loss(guides_mm, visible)
+
+    def _fitted_loss(self, guides_mm: np.ndarray, visible: np.ndarray) -> float:
+        return self._probe.loss(self._with(guides_mm), self._base, visible)
+
+    def _with(self, guides_mm: np.ndarray) -> Hypothesis:
+        return replace(self._base.hypothesis, guides_mm=_plain(guides_mm), shadows=True)
+
+
+def _plain(guides_mm: np.ndarray) -> Guides:
+    return tuple(tuple(float(c) for c in guide) for guide in guides_mm)

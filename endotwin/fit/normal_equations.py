@@ -1,0 +1,199 @@
+"""Normal equations of one Gauss–Newton step over vertex materials and shared parameters.
+
+Each pixel touches the three vertices of its triangle, so the normal matrix of a material channel has the
+sparsity of the mesh. Base colours of different channels do not meet; roughness meets all three. Shared
+parameters border it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.sparse
+import torch
+from torch import Tensor
+
+from endotwin.fit.model import Globals, at_pixels, linearise
+from endotwin.pixels.samples import Samples
+from endotwin.pixels.start import DIFFUSE_SIN2
+
+CHANNELS = 4
+"""Base colour red, green, blue; roughness."""
+
+CORNER_PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
+CHUNK = 1 << 18
+CLIPPED = 255
+
+
+@dataclass(frozen=True)
+class Residual:
+    """Photo minus prediction at N samples [N, 3] and its robust weight [N, 3].
+
+    A clipped photo says "at least": where the prediction is brighter, residual and weight are 0.
+    """
+
+    error: Tensor
+    weight: Tensor
+
+    @classmethod
+    def of(cls, samples: Samples, predicted: Tensor, width: float) -> Residual:
+        """Pseudo-Huber residual: quadratic below ``width`` (display values), linear well above."""
+        error = samples.color.to(predicted.dtype) / 255 - predicted
+        satisfied = (samples.color >= CLIPPED) & (error < 0)
+        error = torch.where(satisfied, 0, error)
+        weight = torch.rsqrt(1 + (error / width) ** 2)
+        return cls(error, torch.where(satisfied, 0, weight))
+
+
+def robust_cost(samples: Samples, predicted: Tensor, width: float) -> float:
+    """Sum of the pseudo-Huber losses width²·(√(1 + (e/width)²) − 1) that ``Residual`` weighs."""
+    error = Residual.of(samples, predicted, width).error.double()
+    return float((width**2 * (torch.sqrt(1 + (error / width) ** 2) - 1)).sum())
+
+
+class MeshPattern:
+    """Where the products of a sample set land in a vertex × vertex matrix."""
+
+    def __init__(self, samples: Samples, triangles: np.ndarray, vertex_count: int):
+        self.vertex_count = vertex_count
+        hit, self.compact = np.unique(samples.triangle.numpy(), return_inverse=True)
+        self.corners = triangles[hit]
+        both = [(k, *pair) for k, (i, j) in enumerate(CORNER_PAIRS) for pair in sorted({(i, j), (j, i)})]
+        entry = np.concatenate([len(CORNER_PAIRS) * np.arange(len(hit)) + k for k, _, _ in both])
+        key = np.concatenate(
+            [self.corners[:, i].astype(np.int64) * vertex_count + self.corners[:, j] for _, i, j in both]
+        )
+        order = np.argsort(key, kind="stable")
+        key, self._entry = key[order], entry[order]
+        self._segments = np.flatnonzero(np.r_[True, key[1:] != key[:-1]])
+        row, column = np.divmod(key[self._segments], vertex_count)
+        pointers = np.searchsorted(row, np.arange(vertex_count + 1))
+        self._pointers, self._indices = (torch.from_numpy(x.astype(np.int32)) for x in (pointers, column))
+
+    def matrix(self, pair_sums: np.ndarray) -> Tensor:
+        """Symmetric CSR [V, V] from sums [T, 6] of weighted products of barycentrics, by CORNER_PAIRS."""
+        values = pair_sums.reshape(-1)[self._entry]
+        data = np.add.reduceat(values, self._segments) if len(values) else values
+        shape = (self.vertex_count, self.vertex_count)
+        parts = (self._pointers, self._indices, torch.from_numpy(data.astype(np.float32)))
+        return torch.sparse_csr_tensor(*parts, shape, check_invariants=False)
+
+    def vector(self, corner_sums: np.ndarray) -> np.ndarray:
+        """Vertex sums [V, C] from triangle corner sums [T, 3, C]."""
+        flat = corner_sums.reshape(-1, corner_sums.shape[2])
+        ids = self.corners.reshape(-1)
+        return np.stack([np.bincount(ids, column, self.vertex_count) for column in flat.T], axis=1)
+
+
+@dataclass(frozen=True)
+class NormalEquations:
+    """JᵀWJ and JᵀWe of one linearisation.
+
+    Attributes:
+        color: three CSR [V, V], base colour by base colour. mixed: three CSR, base colour by roughness.
+        roughness: CSR [V, V].
+        right: float32 [V, 4, 1 + G], JᵀW(e | dC by the G shared parameters) by channel.
+        shared: float64 [G, G] and shared_right [G], those of the shared parameters.
+    """
+
+    color: list[Tensor]
+    mixed: list[Tensor]
+    roughness: Tensor
+    right: Tensor
+    shared: np.ndarray
+    shared_right: np.ndarray
+
+    def __matmul__(self, values: Tensor) -> Tensor:
+        """Product with vertex values [V, 4, K]."""
+        v = [values[:, channel].contiguous() for channel in range(CHANNELS)]
+        rows = [self.color[c] @ v[c] + self.mixed[c] @ v[3] for c in range(3)]
+        rows.append(self.roughness @ v[3] + sum(self.mixed[c] @ v[c] for c in range(3)))
+        return torch.stack(rows, dim=1)
+
+    def lumped(self) -> Tensor:
+        """Row sums as one symmetric 4×4 block a vertex, [V, 4, 4]."""
+        ones = torch.ones(self.right.shape[0], 1)
+        block = torch.zeros(self.right.shape[0], CHANNELS, CHANNELS)
+        for c in range(3):
+            block[:, c, c] = (self.color[c] @ ones)[:, 0]
+            block[:, c, 3] = block[:, 3, c] = (self.mixed[c] @ ones)[:, 0]
+        block[:, 3, 3] = (self.roughness @ ones)[:, 0]
+        return block
+
+
+def pairs_of(corner: np.ndarray) -> np.ndarray:
+    """Products of barycentrics [N, 3] by CORNER_PAIRS, [N, 6]."""
+    return np.stack([corner[:, i] * corner[:, j] for i, j in CORNER_PAIRS], axis=1)
+
+
+def add_products(sums: np.ndarray, ids: np.ndarray, left: np.ndarray, right: np.ndarray) -> None:
+    """Add to ``sums`` [T, L, R] the products of ``left`` [N, L] and ``right`` [N, R] of each sample, whose
+    ``ids`` [N] ascend."""
+    first = np.r_[True, ids[1:] != ids[:-1]]
+    count, width = left.shape
+    column = width * (np.cumsum(first) - 1)[:, None] + np.arange(width)
+    by_id = scipy.sparse.csr_array(
+        (left.ravel(), column.ravel(), np.arange(0, count * width + 1, width)),
+        shape=(count, width * int(first.sum())),
+    )
+    sums[ids[first]] += (by_id.T @ right).reshape(-1, *sums.shape[1:])
+
+
+def assemble(
+    samples: Samples,
+    pattern: MeshPattern,
+    triangles: Tensor,
+    materials: Tensor,
+    shared: Globals,
+    width: float,
+    bordered: bool = True,
+) -> NormalEquations:
+    """Linearise at vertex ``materials`` [V, 4] and ``shared``, and sum over the samples; G is 0 unless
+    ``bordered``.
+
+    Beside bounced light, pixels beyond DIFFUSE_SIN2 tell no roughness: it is known by patches only, and errs
+    by more than the little that roughness does to Burley's diffuse lobe.
+    """
+    count, globals_count = len(pattern.corners), len(shared.vector) if bordered else 0
+    pair_sums = np.zeros((count, len(CORNER_PAIRS), 7), np.float32)
+    corner_sums = np.zeros((count, 3, CHANNELS * (1 + globals_count)), np.float32)
+    normal, right = np.zeros((globals_count,) * 2), np.zeros(globals_count)
+    for start, part in zip(range(0, len(samples), CHUNK), samples.chunks(CHUNK), strict=True):
+        model = linearise(part, at_pixels(part, triangles, materials), shared)
+        residual = Residual.of(part, model.predicted, width)
+        ids = pattern.compact[start : start + len(part)]
+        corner = part.barycentric.numpy()
+        by_roughness = model.by_roughness
+        if part.bounce is not None:
+            by_roughness = torch.where(part.sin2[:, None] < DIFFUSE_SIN2, by_roughness, 0)
+        weighted_color = residual.weight * model.by_color
+        weighted_roughness = residual.weight * by_roughness
+        products = [weighted_color[:, c] * model.by_color[:, c] for c in range(3)]
+        products += [weighted_color[:, c] * by_roughness[:, c] for c in range(3)]
+        products.append((weighted_roughness * by_roughness).sum(dim=1))
+        add_products(pair_sums, ids, pairs_of(corner), torch.stack(products, dim=1).numpy())
+        slopes = model.by_globals[..., :globals_count]
+        against = torch.cat([residual.error[..., None], slopes], dim=2)
+        channels = torch.cat(
+            [
+                weighted_color[..., None] * against,
+                (weighted_roughness[..., None] * against).sum(dim=1, keepdim=True),
+            ],
+            dim=1,
+        ).flatten(1)
+        add_products(corner_sums, ids, corner, channels.numpy())
+        slopes = slopes.flatten(0, 1)
+        weighted = (slopes * residual.weight.reshape(-1, 1)).T
+        normal += (weighted @ slopes).double().numpy()
+        right += (weighted @ residual.error.reshape(-1)).double().numpy()
+    vertex = pattern.vector(corner_sums).astype(np.float32)
+    matrices = [pattern.matrix(pair_sums[:, :, k]) for k in range(7)]
+    return NormalEquations(
+        color=matrices[:3],
+        mixed=matrices[3:6],
+        roughness=matrices[6],
+        right=torch.from_numpy(vertex).reshape(-1, CHANNELS, 1 + globals_count),
+        shared=normal,
+        shared_right=right,
+    )

@@ -1,0 +1,1 @@
+"""How light falls on a surface and what the surface makes of it: shading, guides, bounced light."""

@@ -1,0 +1,144 @@
+"""Light that tissue throws on tissue, at points of the surface that are seen from some views.
+
+``radiosity`` moves light between patches; this is what of it arrives at points, as a function of the light's
+n and q and of how bright the tissue is.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.sparse
+import torch
+from torch import Tensor
+
+from endotwin.light.radiosity import Radiosity
+from endotwin.light.shading import specular_albedo
+
+LIGHT_STEP = 0.05
+"""Step of the finite differences of the bounced light, in n, q and the logarithm of all albedo."""
+
+DARKEST = 1e-30
+
+
+@dataclass(frozen=True)
+class Albedo:
+    """How much of the light from all around patches send back.
+
+    Attributes:
+        base_color: float [P, 3], by the diffuse lobe. glossy: float [P, 1], by the white specular one.
+    """
+
+    base_color: np.ndarray
+    glossy: np.ndarray
+
+    @classmethod
+    def of(
+        cls, radiosity: Radiosity, base_color: Tensor, roughness: Tensor, f0: float, triangles: np.ndarray
+    ) -> Albedo:
+        """That of a surface with ``base_color`` [V, 3] and ``roughness`` [V] at its vertices; ``triangles``
+        int [F, 3] are those of the radiosity's surface, whose vertices may be merged."""
+        answer = torch.cat([base_color, specular_albedo(roughness, f0)[:, None]], dim=1).numpy()
+        corners = [answer.take(triangles[:, k], axis=0) for k in range(3)]
+        mean = radiosity.mean(sum(corners) / np.float32(3))
+        return cls(mean[:, :3], mean[:, 3:])
+
+    def scaled(self, log_scale: float) -> np.ndarray:
+        """In all, [P, 3], with base colours brighter by a factor whose logarithm is ``log_scale``."""
+        return np.exp(log_scale) * self.base_color + self.glossy
+
+
+@dataclass(frozen=True)
+class Places:
+    """Points at which bounced light is wanted.
+
+    Attributes:
+        weights: CSR [N, P], interpolation from patches, as many to each point (``Radiosity.to_points``).
+        view: int [N], in which view each point is seen.
+    """
+
+    weights: scipy.sparse.csr_array
+    view: np.ndarray
+
+    def of(self, per_patch: np.ndarray) -> np.ndarray:
+        """Values [P, M, C] of patches in M views at the points, [N, C]."""
+        if per_patch.shape[1] == 1:
+            return self.weights @ per_patch[:, 0]
+        nearest = self.weights.indices.reshape(len(self.view), -1)
+        weight = self.weights.data.reshape(len(self.view), -1)
+        total = np.zeros((len(self.view), per_patch.shape[2]), np.float32)
+        for k in range(nearest.shape[1]):
+            total += weight[:, k, None] * per_patch[nearest[:, k], self.view]
+        return total
+
+
+@dataclass(frozen=True)
+class Bounce:
+    """Indirect irradiance at N points, E = L0·exp(log + n·by_n + q·by_q + ln κ·by_scale), κ a factor on
+    all albedo.
+
+    Attributes:
+        log: float32 [N, 3]. by_n, by_q, by_scale: float32 [N].
+        gloss: float32 [N], share of it that the specular lobe sends to the camera.
+    """
+
+    log: Tensor
+    by_n: Tensor
+    by_q: Tensor
+    by_scale: Tensor
+    gloss: Tensor
+
+    def __getitem__(self, index) -> Bounce:
+        return Bounce(**{name: value[index] for name, value in vars(self).items()})
+
+    def log_factor(self, n: float, q: float, log_scale: float = 0.0) -> Tensor:
+        """ln E − ``log`` with L0 = 1, [N]."""
+        return n * self.by_n + q * self.by_q + log_scale * self.by_scale
+
+    def irradiance(self, n: float, q: float, log_scale: float = 0.0) -> Tensor:
+        """E with L0 = 1, [N, 3]."""
+        return torch.exp(self.log + self.log_factor(n, q, log_scale)[:, None])
+
+
+class BouncedLight:
+    """Indirect irradiance under the lights of M views.
+
+    Args:
+        radiosity: of the surface. T_local_camera: the views' poses in its frame, float64 [M, 4, 4].
+        guides_mm: [K, 3] in the camera frame, equally bright. profile: see ``guides.log_axis``.
+    """
+
+    def __init__(self, radiosity: Radiosity, T_local_camera: np.ndarray, guides_mm, profile: float):
+        self._radiosity = radiosity
+        self._lamps = [
+            [radiosity.lamp(pose, np.asarray(guide), profile) for guide in guides_mm]
+            for pose in T_local_camera
+        ]
+
+    def at(self, places: Places, n: float, q: float, albedo: np.ndarray) -> np.ndarray:
+        """Irradiance float32 [N, 3] with L0 = 1 and patches of ``albedo`` [P, 3]."""
+        direct = [self._radiosity.direct(lamps, n, q).mean(axis=1) for lamps in self._lamps]
+        return places.of(self._radiosity.indirect(np.stack(direct, axis=1), albedo))
+
+    def expanded(
+        self, places: Places, n: float, q: float, albedo: Albedo, gloss: Tensor, log_scale: float = 0.0
+    ) -> Bounce:
+        """The bounce as a function of n, q and the albedo's scale, exact where they are as given here.
+
+        Slopes are the channels' mean. ``gloss`` [N] is the bounce's.
+        """
+
+        def log_irradiance(n: float, q: float, log_scale: float) -> np.ndarray:
+            return np.log(np.maximum(self.at(places, n, q, albedo.scaled(log_scale)), DARKEST))
+
+        here = log_irradiance(n, q, log_scale)
+        moved = (
+            (n + LIGHT_STEP, q, log_scale),
+            (n, q + LIGHT_STEP, log_scale),
+            (n, q, log_scale + LIGHT_STEP),
+        )
+        slopes = [(log_irradiance(*at) - here).mean(axis=1) / LIGHT_STEP for at in moved]
+        level = here - (n * slopes[0] + q * slopes[1] + log_scale * slopes[2])[:, None]
+        columns = [torch.from_numpy(np.ascontiguousarray(x, np.float32)) for x in (level, *slopes)]
+        return Bounce(*columns, gloss)

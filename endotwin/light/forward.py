@@ -1,0 +1,128 @@
+"""The radiance of a surface point: the one place where it is written, for the renderer and for the fit.
+
+x = Σ_k g_k·(D_k·b/π + f0·S_k + w·f0_water·S'_k) + 2·L0·E·(b + ρ), with g = 2π·L·(n·ωi) of each light guide, D
+the diffuse factor, S the specular lobe of the tissue and S' that of a coat of weight w, E what other tissue
+throws on the point for L0 = 1, and ρ the lobe's share of that. Han & Wu 2025 with one guide at the lens, no
+coat and no E; Burley's diffuse lobe unless D is 1. It is linear in the base colour b, and in what each guide
+gives exponential in n and q: the derivatives by those follow from the same pieces.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from endotwin.light import shading
+from endotwin.light.guides import Guided
+
+LogLight = tuple[float | Tensor, float | Tensor, float | Tensor]
+"""ln L0, n and q of the light, as numbers or as scalar tensors that are to be differentiated by."""
+
+
+@dataclass(frozen=True)
+class Lit:
+    """What lights N points.
+
+    Attributes:
+        cos_o: [N], n·wo. guides: how each of K guides lights them.
+        log_exposure: [N], ln of what camera and lens make of all light; None: 0.
+        irradiance: [N, 3], what other tissue throws on them for L0 = 1; None: nothing.
+        gloss: [N], share of that irradiance which the specular lobe sends to the camera.
+    """
+
+    cos_o: Tensor
+    guides: Guided
+    log_exposure: Tensor | None = None
+    irradiance: Tensor | None = None
+    gloss: Tensor | None = None
+
+    @classmethod
+    def at_lens(cls, cos: Tensor, sin2: Tensor, log_axis: Tensor, log_distance: Tensor, **more) -> Lit:
+        """By the light at the lens: wi = wo = wm (see ``Incidence``, all [N])."""
+        columns = (cos, sin2, torch.ones_like(cos), log_axis, log_distance)
+        return cls(cos, Guided(*(value[:, None] for value in columns)), **more)
+
+
+@dataclass(frozen=True)
+class Lobes:
+    """What all points answer light with.
+
+    Attributes:
+        f0: reflectance of the specular lobe at normal incidence; 0: there is none.
+        burley: whether the diffuse lobe is Burley's, rather than Lambert's.
+        coat: weight and roughness of a coat; None: there is none.
+    """
+
+    f0: float
+    burley: bool = True
+    coat: tuple[float, float] | None = None
+
+
+@dataclass(frozen=True)
+class Share:
+    """What one guide gives to N points, x = per_color·b + shine + weight·coat; each [N], None where the lobe
+    is not there. Its logarithm grows by log_axis with n, and falls by log_distance with q."""
+
+    per_color: Tensor
+    shine: Tensor | None
+    coat: Tensor | None
+    log_axis: Tensor
+    log_distance: Tensor
+
+    def white(self, lobes: Lobes) -> Tensor | None:
+        """What does not depend on the base colour, [N]; None: nothing."""
+        if self.coat is None:
+            return self.shine
+        coat = lobes.coat[0] * self.coat
+        return coat if self.shine is None else self.shine + coat
+
+    def radiance(self, base_color: Tensor, lobes: Lobes) -> Tensor:
+        """[N, 3]."""
+        x, white = self.per_color[:, None] * base_color, self.white(lobes)
+        return x if white is None else x + white[:, None]
+
+
+def shares(lit: Lit, log_light: LogLight, roughness: Tensor, lobes: Lobes) -> list[Share]:
+    """What each guide gives to points of ``roughness`` [N]."""
+    guides, found = lit.guides, []
+    count = guides.cos_i.shape[1]
+    for k in range(count):
+        cos_i, sin2_m, cos_d, log_axis, log_distance = (value[:, k] for value in vars(guides).values())
+        log_strength = shading.log_spotlight(*log_light, log_axis, log_distance)
+        if lit.log_exposure is not None:
+            log_strength = log_strength + lit.log_exposure
+        strength = torch.exp(log_strength) * cos_i * (2 * math.pi / count)
+        per_color = strength / math.pi
+        if lobes.burley:
+            per_color = per_color * shading.burley(cos_i, lit.cos_o, cos_d, roughness)
+        shine = coat = None
+        if lobes.f0 > 0:
+            shine = strength * lobes.f0 * shading.specular_lobe(cos_i, lit.cos_o, sin2_m, roughness)
+        if lobes.coat is not None:
+            wet = torch.full_like(roughness, lobes.coat[1])
+            coat = strength * shading.F0_WATER * shading.specular_lobe(cos_i, lit.cos_o, sin2_m, wet)
+        found.append(Share(per_color, shine, coat, log_axis, log_distance))
+    return found
+
+
+def bounced(lit: Lit, log_light: LogLight) -> Tensor:
+    """2·L0·E of points on which other tissue throws light, [N, 3]: what a base colour of 1 makes of it."""
+    log_factor = torch.as_tensor(log_light[0], dtype=lit.irradiance.dtype)
+    if lit.log_exposure is not None:
+        log_factor = (log_factor + lit.log_exposure)[:, None]
+    return lit.irradiance * (2 * torch.exp(log_factor))
+
+
+def radiance(lit: Lit, log_light: LogLight, base_color: Tensor, roughness: Tensor, lobes: Lobes) -> Tensor:
+    """Radiance x [N, 3] of points with ``base_color`` [N, 3] (of the diffuse lobe: what is metallic has less)
+    and ``roughness`` [N]."""
+    found = shares(lit, log_light, roughness, lobes)
+    x = sum(share.per_color for share in found)[:, None] * base_color
+    if found[0].white(lobes) is not None:
+        x = x + sum(share.white(lobes) for share in found)[:, None]
+    if lit.irradiance is None:
+        return x
+    return x + bounced(lit, log_light) * (base_color + lit.gloss[:, None])

@@ -1,0 +1,105 @@
+"""Light guides beside the lens: how each lights a surface point, and what it casts into shadow.
+
+Vocabulary of ``shading``: ``wi`` unit direction to the guide, ``wo`` to the camera, ``wm`` their half vector.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from endotwin.light.incidence import COS_MIN, DISTANCE_MIN_MM
+from endotwin.surface.casting import Caster
+from endotwin.surface.vectors import dot, unit
+
+SHADOW_BIAS = 0.015
+"""A point is in shadow where a ray to it ends this share of its length before it: a fold rim throws
+shadows from farther away, and the mesh's own facets must throw none."""
+
+COSINE, EXPONENTIAL = 0.0, 1.0
+"""Angular shapes of the light: cosⁿθ (Han & Wu 2025), e^{−n(1−cosθ)} (EndoMapper: Azagra et al. 2023). A
+profile between them mixes their logarithms."""
+
+AT_LENS = ((0.0, 0.0, 0.0),)
+
+
+@dataclass(frozen=True)
+class Guided:
+    """How K guides light N points.
+
+    Attributes:
+        cos_i: n·wi, 0 where the guide is behind the surface or in shadow. sin2_m: |n × wm|². cos_d: wi·wm.
+            log_axis: logarithm of the angular shape for exponent 1. log_distance: ln of the distance in mm.
+            All float32 [N, K].
+    """
+
+    cos_i: Tensor
+    sin2_m: Tensor
+    cos_d: Tensor
+    log_axis: Tensor
+    log_distance: Tensor
+
+    def __len__(self) -> int:
+        return len(self.cos_i)
+
+    def __getitem__(self, index) -> Guided:
+        return Guided(**{name: value[index] for name, value in vars(self).items()})
+
+
+def log_axis(cos_axis: np.ndarray, profile: float) -> np.ndarray:
+    """Logarithm of the light's angular shape for exponent 1, of cosθ at least COS_MIN."""
+    if profile == COSINE:
+        return np.log(cos_axis)
+    return (1 - profile) * np.log(cos_axis) + profile * (cos_axis - 1)
+
+
+def guided(
+    points_mm: np.ndarray,
+    normals: np.ndarray,
+    guides_mm: np.ndarray,
+    profile: float,
+    visible: np.ndarray | None = None,
+) -> Guided:
+    """What guides at ``guides_mm`` [K, 3] do to ``points_mm`` [N, 3] with unit ``normals`` [N, 3].
+
+    Everything is in the camera frame; each guide shines along the optical axis.
+
+    Args:
+        visible: [N, K], share of each guide that the point sees; all of it unless given.
+    """
+    columns = {name: [] for name in Guided.__dataclass_fields__}
+    wo = unit(-points_mm)
+    for k, guide_mm in enumerate(np.asarray(guides_mm, np.float32)):
+        towards = guide_mm - points_mm
+        distance_mm = np.maximum(np.sqrt(dot(towards, towards)), DISTANCE_MIN_MM)
+        wi = towards / distance_mm[:, None]
+        wm = unit(wi + wo)
+        across = np.cross(normals, wm)
+        cos_i = np.maximum(dot(normals, wi), 0)
+        columns["cos_i"].append(cos_i if visible is None else cos_i * visible[:, k])
+        columns["sin2_m"].append(dot(across, across))
+        columns["cos_d"].append(dot(wi, wm))
+        columns["log_axis"].append(log_axis(np.maximum(-wi[:, 2], COS_MIN), profile))
+        columns["log_distance"].append(np.log(distance_mm))
+    return Guided(**{name: torch.from_numpy(np.stack(value, axis=1)) for name, value in columns.items()})
+
+
+def visible_from(
+    caster: Caster, T_local_camera: np.ndarray, points_mm: np.ndarray, guides_mm: np.ndarray
+) -> np.ndarray:
+    """Which points [N, 3] (camera frame) each guide [K, 3] sees, float32 [N, K] of 0 and 1.
+
+    ``T_local_camera`` [4, 4] is the view's pose in the surface's local frame.
+    """
+    rotation, centre = T_local_camera[:3, :3].astype(np.float32), T_local_camera[:3, 3].astype(np.float32)
+    seen = np.empty((len(points_mm), len(guides_mm)), np.float32)
+    for k, guide_mm in enumerate(np.asarray(guides_mm, np.float32)):
+        ray = points_mm - guide_mm
+        distance_mm = np.maximum(np.sqrt(dot(ray, ray)), DISTANCE_MIN_MM)
+        directions = (ray / distance_mm[:, None]) @ rotation.T
+        origin = np.broadcast_to(centre + rotation @ guide_mm, directions.shape)
+        seen[:, k] = caster.unobstructed(origin, directions, distance_mm * (1 - SHADOW_BIAS))
+    return seen

@@ -1,0 +1,144 @@
+"""Light on tissue: the spotlight, the Disney/GGX BRDF and the camera response, in torch.
+
+Vocabulary as in the literature: ``n`` surface normal, ``wi`` unit direction to the light, ``wo`` to the
+camera, ``wm`` the half vector; ``cos_i`` = n·wi, ``cos_o`` = n·wo, ``sin2_m`` = |n × wm|². Sources: Han &
+Wu 2025 (EndoPBR); Burley 2012 (Disney BRDF); Walter et al. 2007 (GGX, Smith shadowing).
+
+Everything is finite, with finite gradients, for cos in [0, 1], roughness in [0, 1] and distance > 0: the
+1/(4 cos_i cos_o) of the microfacet model is cancelled analytically against Smith's G, and powers are taken
+of logarithms.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+from torch import Tensor
+
+F0_DIELECTRIC = 0.04
+"""Reflectance of tissue at normal incidence: ((1.5 - 1) / (1.5 + 1))², Burley's ``specular`` 0.5."""
+
+F0_WATER = 0.02
+"""((1.33 − 1) / (1.33 + 1))²."""
+
+ROUGHNESS_TISSUE = 0.4
+"""Roughness of tissue where nothing tells it yet."""
+
+ROUGHNESS_MIN = 0.045
+"""Least roughness: α = r² = 0.002 keeps the GGX peak 1/(π α²) and its slope within float32."""
+
+RADIANCE_MIN = 1e-6
+"""Least radiance that the response sees; x^γ has infinite slope at 0. In display values 1e-6^(1/2.2) is half
+an 8-bit step.
+"""
+
+
+def log_spotlight(
+    log_intensity: float | Tensor,
+    cone: float | Tensor,
+    falloff: float | Tensor,
+    log_cos_axis: Tensor,
+    log_distance: Tensor,
+) -> Tensor:
+    """Logarithm of L(x) = L0·cosⁿθ / d^q (Han & Wu, light model).
+
+    Args:
+        log_intensity: ln L0, []. cone: n, []. falloff: q, [].
+        log_cos_axis: ln cosθ, [N], θ between the optical axis and the direction from the light.
+            log_distance: ln d, d in mm, [N].
+    """
+    return log_intensity + cone * log_cos_axis - falloff * log_distance
+
+
+def burley(cos_i: Tensor, cos_o: Tensor, cos_d: Tensor, roughness: Tensor) -> Tensor:
+    """Retro-reflection of rough diffuse surfaces at grazing angles, [N]: Burley 2012, sec. 5.3, with
+    π·f_d/base_color = 1 head-on.
+
+    Written as in Burley 2015 (eq. 4): (1 − F_i/2)(1 − F_o/2) + R (F_i + F_o + F_i F_o (R − 1)), R =
+    2·roughness·cos_d².
+    """
+    fresnel_i, fresnel_o = (1 - cos_i) ** 5, (1 - cos_o) ** 5
+    retro = 2 * roughness * cos_d * cos_d
+    return (1 - fresnel_i / 2) * (1 - fresnel_o / 2) + retro * (
+        fresnel_i + fresnel_o + fresnel_i * fresnel_o * (retro - 1)
+    )
+
+
+def diffuse(base_color: Tensor, metallic: Tensor) -> Tensor:
+    """Lambertian lobe f_d = (1 − m)·b/π, [N, 3], of base_color [N, 3] and metallic [N] (Han & Wu)."""
+    return base_color * ((1 - metallic) / math.pi)[..., None]
+
+
+def ggx(sin2_m: Tensor, alpha: Tensor) -> Tensor:
+    """GGX normal distribution D(wm) [N] (Walter et al. 2007, eq. 33), from sin² for precision at the peak.
+
+    With c² = 1 − s² the usual denominator c²(α² − 1) + 1 is s² + α²c², without cancellation.
+    """
+    alpha2 = alpha * alpha
+    return alpha2 / (math.pi * (sin2_m + alpha2 * (1 - sin2_m)) ** 2)
+
+
+def smith_visibility(cos_i: Tensor, cos_o: Tensor, alpha: Tensor) -> Tensor:
+    """G / (4 cos_i cos_o) [N] with Smith's separable G for GGX (Walter et al. 2007, eq. 34), cancelled:
+    bounded by 1/(4α²).
+    """
+
+    def half(cos: Tensor) -> Tensor:
+        return cos + torch.sqrt(alpha * alpha * (1 - cos * cos) + cos * cos)
+
+    return 1 / (half(cos_i) * half(cos_o))
+
+
+def specular(
+    cos_i: Tensor, cos_o: Tensor, sin2_m: Tensor, cos_d: Tensor, roughness: Tensor, f0: Tensor
+) -> Tensor:
+    """White GGX lobe f_s = D·F·G / (4 cos_i cos_o), [N]; ``cos_d`` = wi·wm enters Schlick's F = f0 + (1 −
+    f0)(1 − cos_d)⁵.
+    """
+    fresnel = f0 + (1 - f0) * (1 - cos_d) ** 5
+    return specular_lobe(cos_i, cos_o, sin2_m, roughness) * fresnel
+
+
+def specular_lobe(cos_i: Tensor, cos_o: Tensor, sin2_m: Tensor, roughness: Tensor) -> Tensor:
+    """``specular`` per unit of f0, for a light so near the lens that Schlick's (1 − cos_d)⁵ vanishes: 1e-9
+    at 10° between them."""
+    alpha = roughness.clamp_min(ROUGHNESS_MIN) ** 2
+    return ggx(sin2_m, alpha) * smith_visibility(cos_i, cos_o, alpha)
+
+
+def specular_colocated(cos: Tensor, sin2: Tensor, roughness: Tensor) -> Tensor:
+    """``specular`` per unit of f0, with the light at the lens: wi = wo = wm, so cos_d = 1 and F = f0."""
+    return specular_lobe(cos, cos, sin2, roughness)
+
+
+def specular_of_even_light(cos_o: Tensor, roughness: Tensor, f0: float) -> Tensor:
+    """Share of light from all around that the white GGX lobe sends to the camera, [N]: Karis 2014
+    ("Physically Based Shading on Mobile"), a fit to Lazarov's table, within 0.01 of the integral."""
+    first = 1 - roughness
+    grazing = torch.minimum(first * first, torch.exp2(-9.28 * cos_o)) * first + 0.0425 - 0.0275 * roughness
+    scale = -1.04 * grazing + 1.04 - 0.572 * roughness
+    bias = 1.04 * grazing - 0.04 + 0.022 * roughness
+    return f0 * scale + bias
+
+
+def specular_albedo(roughness: Tensor, f0: float) -> Tensor:
+    """Share of light from all around that the white GGX lobe sends back in all, [N]: 2·∫ρ(cos)·cos d cos."""
+    nodes, weights = np.polynomial.legendre.leggauss(8)
+    cos = torch.from_numpy((nodes + 1) / 2).to(roughness.dtype)
+    share = specular_of_even_light(cos, roughness[..., None], f0)
+    return (share * cos * torch.from_numpy(weights).to(roughness.dtype)).sum(dim=-1)
+
+
+def respond(radiance: Tensor, gamma: float | Tensor) -> Tensor:
+    """Camera response C = x^γ of radiance x ≥ 0, shifted so that C(0) = 0 with the slope that x^γ has at
+    RADIANCE_MIN.
+    """
+    gamma = torch.as_tensor(gamma, dtype=radiance.dtype)
+    return torch.exp(gamma * torch.log(radiance + RADIANCE_MIN)) - torch.exp(gamma * math.log(RADIANCE_MIN))
+
+
+def radiance_of(color: np.ndarray, gamma: float) -> np.ndarray:
+    """Radiance x that ``respond`` shows as C = ``color`` below 1, of its shape."""
+    return (color + RADIANCE_MIN**gamma) ** (1 / gamma) - RADIANCE_MIN

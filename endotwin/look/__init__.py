@@ -1,0 +1,1 @@
+"""Pictures and windows that show a twin, and a trajectory in it."""

@@ -1,0 +1,116 @@
+"""Robust linear least squares with one free intercept a group: "fixed effects".
+
+Subtracting each group's mean from target and columns takes the intercepts out exactly, so that thousands of
+unknown albedos cost two histograms a column. A second kind of intercept (of frames, say) is solved for.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.sparse import csr_array
+
+HUBER = 1.345
+REWEIGHTS = 5
+RIDGE = 1e-9
+"""Share of the trace added to the normal matrix: a column without variation gets the coefficient 0."""
+
+
+@dataclass(frozen=True)
+class Design:
+    """What explains N values.
+
+    Attributes:
+        columns: float [N, C]. group: int [N] in 0 … count − 1, each with its own intercept.
+        category: int [N], a second partition whose intercepts are wanted (the first is 0); None: there is
+        none.
+        weight: [N], inverse variances up to one factor; None: all alike.
+        prior: precision [C, C] and pull [C] of the coefficients, beside values of variance 1 / weight; None:
+        nothing is known of them.
+    """
+
+    columns: np.ndarray
+    group: np.ndarray
+    count: int
+    category: np.ndarray | None = None
+    weight: np.ndarray | None = None
+    prior: tuple[np.ndarray, np.ndarray] | None = None
+
+    def __getitem__(self, rows: np.ndarray) -> Design:
+        category, weight = (None if x is None else x[rows] for x in (self.category, self.weight))
+        return Design(self.columns[rows], self.group[rows], self.count, category, weight, self.prior)
+
+    def explained(self, found: FixedEffects) -> np.ndarray:
+        """The values [N] without the groups' intercepts."""
+        values = self.columns @ found.coefficients
+        return values if self.category is None else values + found.intercepts[self.category]
+
+
+@dataclass(frozen=True)
+class FixedEffects:
+    """Coefficients float64 [C], intercepts of the categories [K], and the robust width of what is left."""
+
+    coefficients: np.ndarray
+    intercepts: np.ndarray
+    width: float
+
+
+def without_means(values: np.ndarray, weight: np.ndarray, group: np.ndarray, count: int) -> np.ndarray:
+    """Values [N, K] less the weighted mean of each of ``count`` groups [N]: the variation within groups."""
+    total = np.maximum(np.bincount(group, weight, count), 1e-12)
+    means = [np.bincount(group, weight * column, count) / total for column in values.T]
+    return values - np.stack(means, axis=1)[group]
+
+
+def regress(target: np.ndarray, design: Design, categories: int = 0, rounds: int = REWEIGHTS) -> FixedEffects:
+    """Huber regression (iteratively reweighted) of ``target`` [N]; ``categories`` is their number."""
+    trust = np.ones(len(target)) if design.weight is None else design.weight
+    weight, width = trust, 1.0
+    group, count, slopes = design.group, design.count, design.columns.shape[1]
+    for _ in range(rounds):
+        within = without_means(np.c_[design.columns, target], weight, group, count)
+        normal, right = _normal_equations(within, weight, design, categories)
+        normal[np.diag_indices_from(normal)] += RIDGE * np.trace(normal) + 1e-12
+        if design.prior is not None:
+            precision, pull = design.prior
+            normal[:slopes, :slopes] += width**2 * precision
+            right[:slopes] += width**2 * pull
+        solved = np.linalg.solve(normal, right)
+        found = FixedEffects(solved[:slopes], np.r_[0.0, solved[slopes:]], 0.0)
+        left = (target - design.explained(found))[:, None]
+        left = np.abs(without_means(left, weight, group, count)[:, 0]) * np.sqrt(trust)
+        width = max(1.4826 * float(np.median(left)), 1e-6) if len(left) else 1e-6
+        weight = trust * np.minimum(1, HUBER * width / np.maximum(left, 1e-12))
+    return FixedEffects(found.coefficients, found.intercepts, width)
+
+
+def _normal_equations(
+    within: np.ndarray, weight: np.ndarray, design: Design, categories: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Normal matrix and right-hand side of ``within`` [N, C + 1] (the last is the target), and of the
+    categories after the first.
+
+    Demeaning is a projection, so products of demeaned columns with plain dummies are those with demeaned
+    ones.
+    """
+    slopes, target = within[:, :-1], within[:, -1]
+    normal, right = (slopes * weight[:, None]).T @ slopes, slopes.T @ (weight * target)
+    if design.category is None:
+        return normal, right
+    category = design.category
+    sums = [np.bincount(category, weight * column, categories) for column in within.T]
+    border = np.stack(sums[:-1], axis=1)
+    shared = csr_array((weight, (design.group, category)), shape=(design.count, categories))
+    total = np.maximum(np.asarray(shared.sum(axis=1)).ravel(), 1e-12)
+    between = (shared.T @ (csr_array((1 / total, (np.arange(len(total)),) * 2)) @ shared)).toarray()
+    dummies = np.diag(np.bincount(category, weight, categories)) - between
+    full = np.block([[normal, border[1:].T], [border[1:], dummies[1:, 1:]]])
+    return full, np.r_[right, sums[-1][1:]]
+
+
+def robust_losses(target: np.ndarray, design: Design, found: FixedEffects, width: float) -> np.ndarray:
+    """Pseudo-Huber losses [N] of what was ``found``, each group at its own mean."""
+    left = (target - design.explained(found))[:, None]
+    residual = without_means(left, np.ones(len(target)), design.group, design.count)[:, 0]
+    return width**2 * (np.sqrt(1 + (residual / width) ** 2) - 1)

@@ -1,0 +1,199 @@
+"""What the fit looks at: training pixels, with the surface point and the geometry behind each."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from endotwin.cameras.base import Camera
+from endotwin.light.bounced import Bounce
+from endotwin.light.forward import Lit
+from endotwin.light.guides import Guided
+from endotwin.light.incidence import incidence
+from endotwin.pixels.length_unit import unit_mm
+from endotwin.pixels.pace import Pace
+from endotwin.run.ahead import ahead
+from endotwin.run.threads import THREADS
+from endotwin.sequence import Frame
+from endotwin.surface.casting import Caster
+from endotwin.surface.silhouettes import discontinuities
+from endotwin.twin import Twin
+
+DEPTH_TOLERANCE_MM = 0.3
+DEPTH_TOLERANCE = 0.01
+"""A ray agrees with the measured depth within max(DEPTH_TOLERANCE_MM, DEPTH_TOLERANCE·depth), the
+former in units of the scene."""
+
+BLACK, CLIPPED = 5, 255
+LEAST_SHOWN = 0.01
+"""A photo with a smaller share between these levels shows nothing: the light was off, or too near."""
+
+logger = logging.getLogger("endotwin")
+
+
+@dataclass(frozen=True)
+class Views:
+    """The photos that samples come from.
+
+    Attributes:
+        camera: that took them. lens_mask: bool [H, W], pixels within the lens circle.
+        frames: int [F], their numbers in the sequence, ascending.
+        T_local_camera: float64 [F, 4, 4], their poses in the surface's frame.
+    """
+
+    camera: Camera
+    lens_mask: np.ndarray
+    frames: np.ndarray
+    T_local_camera: np.ndarray
+
+    def row(self, frame: Tensor) -> np.ndarray:
+        """Where frames [N] stand among ``frames``, int [N]."""
+        return np.searchsorted(self.frames, frame.numpy())
+
+
+@dataclass(frozen=True)
+class Samples:
+    """N training pixels, ordered by triangle.
+
+    Attributes:
+        triangle: int64 [N], ascending. barycentric: float32 [N, 3].
+        cos, sin2, log_cos_axis, log_distance: float32 [N], see ``Incidence``.
+        color: uint8 [N, 3], display-encoded.
+        frame: int32 [N], index of the photo. pixel: int32 [N], row-major.
+        guides: how guides beside the lens light the pixels; None: the light is at the lens.
+        bounce: what other tissue throws on them; None: nothing.
+        log_exposure: float32 [N], ln of gain and vignetting; None: 0.
+        views: the photos; None for samples that no photo showed.
+    """
+
+    triangle: Tensor
+    barycentric: Tensor
+    cos: Tensor
+    sin2: Tensor
+    log_cos_axis: Tensor
+    log_distance: Tensor
+    color: Tensor
+    frame: Tensor
+    pixel: Tensor
+    guides: Guided | None = None
+    bounce: Bounce | None = None
+    log_exposure: Tensor | None = None
+    views: Views | None = None
+
+    def __len__(self) -> int:
+        return len(self.triangle)
+
+    def __getitem__(self, index) -> Samples:
+        rows = {name: value for name, value in vars(self).items() if value is not None and name != "views"}
+        return replace(self, **{name: value[index] for name, value in rows.items()})
+
+    @property
+    def directions(self) -> np.ndarray:
+        """Unit viewing rays in the camera frame, float32 [N, 3]."""
+        return self.views.camera.pixel_directions.reshape(-1, 3)[self.pixel.numpy()]
+
+    @property
+    def points_mm(self) -> np.ndarray:
+        """Surface points in the camera frame, float32 [N, 3]."""
+        return self.directions * self.log_distance.exp().numpy()[:, None]
+
+    def lit(self, n: float, q: float, log_scale: float = 0.0) -> Lit:
+        """What lights the pixels, where the light's n and q and the albedo's scale say what is bounced."""
+        more = {"log_exposure": self.log_exposure}
+        if self.bounce is not None:
+            more |= {"irradiance": self.bounce.irradiance(n, q, log_scale), "gloss": self.bounce.gloss}
+        if self.guides is not None:
+            return Lit(self.cos, self.guides, **more)
+        return Lit.at_lens(self.cos, self.sin2, self.log_cos_axis, self.log_distance, **more)
+
+    def thinned(self, count: int, generator: np.random.Generator) -> Samples:
+        """About ``count`` of the samples, drawn evenly at random; all of them if there are no more."""
+        if len(self) <= count:
+            return self
+        return self[torch.from_numpy(drawn(len(self), count, generator))]
+
+    def chunks(self, size: int) -> Iterator[Samples]:
+        """Consecutive pieces of at most ``size`` samples."""
+        for start in range(0, len(self), size):
+            yield self[start : start + size]
+
+
+def drawn(count: int, wanted: int, generator: np.random.Generator) -> np.ndarray:
+    """About ``wanted`` of ``count`` rows, drawn evenly at random, ascending; all if there are no more."""
+    if count <= wanted:
+        return np.arange(count)
+    return np.flatnonzero(generator.random(count, np.float32) < wanted / count)
+
+
+def gather(twin: Twin, pace: Pace, seed: int, caster: Caster) -> Samples:
+    """About ``pace.pixels`` pixels, or all, drawn evenly from what its photos show of the surface.
+
+    A pixel counts if it lies within the lens circle, has a depth, lies off depth discontinuities, and its
+    ray meets
+    the surface at that depth. A photo that is all black or clipped is left out with a warning, unless all
+    are.
+    """
+    sequence = twin.sequence()
+    frames = twin.source.training(len(sequence))
+    share = pace.share(len(frames), int(sequence.lens_mask.sum()))
+
+    def one(index: int) -> tuple[int, Samples]:
+        generator = np.random.default_rng((seed, index))
+        return index, _frame_samples(
+            twin, caster, sequence.frame(index), sequence.lens_mask, share, generator
+        )
+
+    read, parts = [], []
+    for done, (index, part) in enumerate(ahead(one, pace.photos(frames), THREADS), 1):
+        read.append(index)
+        parts.append(part)
+        pace.report("gather pixels", done, len(frames))
+    shows = [len(part) > 0 and _shown(part) >= LEAST_SHOWN for part in parts]
+    for index, part, tells in zip(read, parts, shows, strict=True):
+        if len(part) and not tells and any(shows):
+            logger.warning("%s is black or clipped and is not fitted", sequence.color_files[index])
+    parts = [part for part, tells in zip(parts, shows, strict=True) if tells or not any(shows)]
+    columns = [name for name, value in vars(parts[0]).items() if value is not None]
+    joined = Samples(**{name: torch.cat([getattr(part, name) for part in parts]) for name in columns})
+    shown = np.unique(joined.frame.numpy())
+    T_local_camera = twin.surface.to_local(sequence.T_world_camera[shown])
+    views = Views(twin.camera, sequence.lens_mask, shown, T_local_camera)
+    return replace(joined[torch.argsort(joined.triangle, stable=True)], views=views)
+
+
+def _shown(part: Samples) -> float:
+    """The share of the samples that are neither black nor clipped."""
+    brightest = part.color.max(dim=1).values
+    return float(((brightest > BLACK) & (brightest < CLIPPED)).float().mean())
+
+
+def _frame_samples(
+    twin: Twin,
+    caster: Caster,
+    frame: Frame,
+    lens_mask: np.ndarray,
+    share: float,
+    generator: np.random.Generator,
+) -> Samples:
+    chosen = lens_mask & np.isfinite(frame.depth_mm) & ~discontinuities(frame.depth_mm)
+    if share < 1:
+        chosen &= generator.random(chosen.shape, np.float32) < share
+    hits = caster.cast(twin.camera, frame.T_world_camera, chosen)
+    depth_mm = frame.depth_mm.reshape(-1)[hits.pixel]
+    cast_mm = hits.distance_mm * twin.camera.pixel_directions.reshape(-1, 3)[hits.pixel, 2]
+    least_mm = unit_mm(twin.surface) * DEPTH_TOLERANCE_MM
+    hits = hits[np.abs(cast_mm - depth_mm) <= np.maximum(least_mm, DEPTH_TOLERANCE * depth_mm)]
+    geometry = incidence(hits, twin.surface, twin.camera, frame.T_world_camera)
+    return Samples(
+        triangle=torch.from_numpy(hits.triangle.astype(np.int64)),
+        barycentric=torch.from_numpy(hits.barycentric),
+        color=torch.from_numpy(frame.color.reshape(-1, 3)[hits.pixel]),
+        frame=torch.full((len(hits),), frame.index, dtype=torch.int32),
+        pixel=torch.from_numpy(hits.pixel.astype(np.int32)),
+        **{name: torch.from_numpy(value) for name, value in vars(geometry).items()},
+    )

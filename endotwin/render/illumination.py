@@ -1,0 +1,140 @@
+"""What lights a twin's surface in one view: the light at the lens or guides beside it, shadows, bounced
+light."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from endotwin.light import shading
+from endotwin.light.bounced import Albedo, BouncedLight, Places
+from endotwin.light.forward import Lit, Lobes, radiance
+from endotwin.light.guides import AT_LENS, COSINE, guided, log_axis, visible_from
+from endotwin.light.incidence import COS_MIN, incidence_on
+from endotwin.light.radiosity import Radiosity
+from endotwin.surface.casting import Caster, Correspondences
+from endotwin.twin import Twin
+
+
+class Illumination:
+    """The light of one twin; makes only what the twin's effects ask for.
+
+    Args:
+        before: that of another edit of the same twin; what the edits have in common is not made again. Form
+            factors are kept through edits that have no use for them.
+    """
+
+    def __init__(self, twin: Twin, caster: Caster, before: Illumination | None = None):
+        self.twin = twin
+        self._caster = caster
+        self._radiosity = before._radiosity if before else None
+        self._albedo = None
+        if twin.effects.bounce > 0:
+            cell_mm = twin.effects["interreflection"].cell_mm
+            if self._radiosity is None or self._radiosity.cell_mm != cell_mm:
+                self._radiosity = Radiosity(twin.surface, caster, cell_mm)
+            elif before.twin.materials is twin.materials:
+                self._albedo = before._albedo
+            if self._albedo is None:
+                self._albedo = _albedo(twin, self._radiosity)
+
+    @property
+    def nbytes(self) -> int:
+        """Memory of what is kept between views, bytes."""
+        return 0 if self._radiosity is None else self._radiosity.nbytes
+
+    def at(self, T_world_camera: np.ndarray) -> ViewLight:
+        """The light of the view from ``T_world_camera`` [4, 4]."""
+        T_local_camera = self.twin.surface.to_local(T_world_camera)
+        irradiance = None if self._albedo is None else self._bounced(T_local_camera)
+        return ViewLight(self.twin, self._caster, T_local_camera, irradiance)
+
+    def _bounced(self, T_local_camera: np.ndarray) -> np.ndarray:
+        """Indirect irradiance of the vertices, float32 [V, 3], with L0 = 1."""
+        light, effects, to_vertex = self.twin.light, self.twin.effects, self._radiosity.to_vertex
+        guides_mm = effects.guides_mm or AT_LENS
+        bounced = BouncedLight(self._radiosity, T_local_camera[None], guides_mm, effects.profile)
+        places = Places(to_vertex, np.zeros(to_vertex.shape[0], np.int32))
+        return effects.bounce * bounced.at(places, light.n, light.q, self._albedo)
+
+
+@dataclass(frozen=True)
+class ViewLight:
+    """The light of one view.
+
+    Attributes:
+        T_local_camera: the pose in the surface's frame, float64 [4, 4].
+        irradiance: what other tissue throws on each vertex, float32 [V, 3], with L0 = 1; None: nothing.
+    """
+
+    twin: Twin
+    caster: Caster
+    T_local_camera: np.ndarray
+    irradiance: np.ndarray | None
+
+    def radiance(
+        self, hits: Correspondences, directions: np.ndarray, normals: np.ndarray, material: Tensor
+    ) -> tuple[Tensor, np.ndarray | None]:
+        """Radiance of hits.
+
+        Args:
+            directions: unit viewing rays of all pixels, float32 [..., 3]. normals: float32 [N, 3]; both in
+                the camera frame. material: base colour, roughness and metallic of the hits, [N, 5].
+
+        Returns:
+            float32 [N, 3]; and which guides each point sees, float32 [N, K] (None where no shadow is cast).
+        """
+        twin, roughness = self.twin, material[:, 3]
+        more = {}
+        if self.irradiance is not None:
+            gloss = shading.specular_of_even_light(
+                _cos_o(hits, directions, normals), roughness, twin.materials.f0
+            )
+            bounced = torch.from_numpy(hits.interpolate(twin.surface, self.irradiance))
+            more = {"irradiance": bounced, "gloss": gloss}
+        lit, visible = self._lit(hits, directions, normals, more)
+        log_light = (math.log(max(twin.light.L0, 1e-30)), twin.light.n, twin.light.q)
+        base_color = material[:, :3] * (1 - material[:, 4:])
+        return radiance(lit, log_light, base_color, roughness, _lobes(twin)), visible
+
+    def _lit(
+        self, hits: Correspondences, directions: np.ndarray, normals: np.ndarray, more: dict[str, Tensor]
+    ) -> tuple[Lit, np.ndarray | None]:
+        """What lights the hits, with what comes from other tissue in ``more``; and which guides they see."""
+        effects = self.twin.effects
+        if effects.guides_mm is None:
+            geometry = incidence_on(normals, hits, directions)
+            if effects.profile != COSINE:
+                axis = log_axis(np.exp(geometry.log_cos_axis), effects.profile)
+                geometry = replace(geometry, log_cos_axis=axis)
+            return Lit.at_lens(*(torch.from_numpy(value) for value in vars(geometry).values()), **more), None
+        points_mm = directions.reshape(-1, 3).take(hits.pixel, axis=0) * hits.distance_mm[:, None]
+        guides_mm, visible = np.asarray(effects.guides_mm, np.float32), None
+        if "shadows" in effects:
+            visible = visible_from(self.caster, self.T_local_camera, points_mm, guides_mm)
+        guides = guided(points_mm, normals, guides_mm, effects.profile, visible)
+        return Lit(_cos_o(hits, directions, normals), guides, **more), visible
+
+
+def _lobes(twin: Twin) -> Lobes:
+    coat = twin.effects.get("coat")
+    wet = None if coat is None else (coat.weight, coat.roughness)
+    return Lobes(twin.materials.f0, twin.materials.diffuse == "burley", wet)
+
+
+def _albedo(twin: Twin, radiosity: Radiosity) -> np.ndarray:
+    """Share of light from all around that each patch sends back, float [P, 3]."""
+    materials = twin.materials
+    diffuse = torch.from_numpy(materials.base_color * (1 - materials.metallic)[:, None])
+    roughness = torch.from_numpy(materials.roughness)
+    return Albedo.of(radiosity, diffuse, roughness, materials.f0, twin.surface.triangles).scaled(0.0)
+
+
+def _cos_o(hits: Correspondences, directions: np.ndarray, normals: np.ndarray) -> Tensor:
+    """n·wo of hits, float32 [N], at least COS_MIN."""
+    view = directions.reshape(-1, 3).take(hits.pixel, axis=0)
+    return torch.from_numpy(np.clip(-(normals * view).sum(axis=1), COS_MIN, 1))

@@ -1,0 +1,239 @@
+"""Relighting: what the twin looks like from any pose."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from copy import copy
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+
+from endotwin.cameras import Camera
+from endotwin.errors import OptionError, TwinError
+from endotwin.light import shading
+from endotwin.light.incidence import to_camera
+from endotwin.render.illumination import Illumination, ViewLight
+from endotwin.sequence.poses import as_poses
+from endotwin.surface.casting import Caster, Correspondences
+from endotwin.surface.silhouettes import discontinuities
+from endotwin.surface.vectors import dot
+from endotwin.twin import Twin, as_twin
+
+SUBPIXELS = 2
+"""A pixel at a silhouette or a shadow's edge is the mean of SUBPIXELS² rays."""
+
+FACING = 0.05
+"""Least cosine between normal and ray of a surface that shows its colour. At the rim of a fold less of it
+than a hundredth of a pixel is steeper: what is there in a mesh is the back of a sliver, a black dot."""
+
+
+@dataclass(frozen=True, eq=False)
+class Rays:
+    """Viewing rays that need no camera: unit ``pixel_directions`` float32 [..., 3] in the camera frame."""
+
+    pixel_directions: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """One rendered view and the labels that come with it.
+
+    Attributes:
+        color: float32 [H, W, 3], display-encoded, in [0, 1]; 0 where no surface is seen.
+        radiance: float32 [H, W, 3], linear, before the response; 1 is display white.
+        hits: the pixel → surface correspondences behind it.
+        shape: (H, W).
+    """
+
+    color: np.ndarray
+    radiance: np.ndarray
+    hits: Correspondences
+    shape: tuple[int, int]
+    _renderer: Renderer
+    _normals: np.ndarray
+
+    def image(self, values: np.ndarray, empty: float = 0.0) -> np.ndarray:
+        """Values of the hits, [N, ...], as an image [H, W, ...] with ``empty`` where no surface is seen."""
+        return laid_out(values, self.hits.pixel, self.shape, empty)
+
+    @cached_property
+    def mask(self) -> np.ndarray:
+        """Bool [H, W]: pixels that see the surface."""
+        return self.image(np.ones(len(self.hits), bool), False)
+
+    @cached_property
+    def depth_mm(self) -> np.ndarray:
+        """Float32 [H, W], z-depth; NaN where no surface is seen."""
+        z = self._renderer.camera.pixel_directions.reshape(-1, 3)[:, 2].take(self.hits.pixel)
+        return self.image(self.hits.distance_mm * z, np.nan)
+
+    @cached_property
+    def normals(self) -> np.ndarray:
+        """Float32 [H, W, 3], unit normals in the camera frame; 0 where no surface is seen."""
+        return self.image(self._normals)
+
+    def attribute(self, per_vertex: np.ndarray) -> np.ndarray:
+        """A vertex attribute [V, ...] interpolated at the hits, [N, ...]."""
+        return self.hits.interpolate(self._renderer.twin.surface, per_vertex)
+
+
+def laid_out(values: np.ndarray, pixel: np.ndarray, shape: tuple[int, int], empty: float = 0.0) -> np.ndarray:
+    """Values [N, ...] of row-major pixels [N] as an image [H, W, ...] with ``empty`` elsewhere."""
+    rows = np.concatenate([values, np.full((1, *values.shape[1:]), empty, values.dtype)])
+    row = np.full(shape[0] * shape[1], len(values), np.int32)
+    row[pixel] = np.arange(len(values))
+    return rows.take(row, axis=0).reshape(*shape, *values.shape[1:])
+
+
+class Renderer:
+    """Renders views of one fitted twin through one camera; may be called from several threads.
+
+    Args:
+        twin: or its folder. camera: the twin's own unless given. threads: of the ray casting.
+        caster: one of the same surface, to share. exposure: factor on the radiance, one or one a channel.
+    """
+
+    def __init__(
+        self,
+        twin: Twin | Path | str,
+        camera: Camera | None = None,
+        threads: int = 2,
+        caster: Caster | None = None,
+        exposure: Sequence[float] | float = 1.0,
+    ):
+        twin = as_twin(twin)
+        if not twin.fitted:
+            raise TwinError("the twin has no materials yet; run 'endotwin fit' on it first")
+        self.twin = twin
+        self.camera = camera or twin.camera
+        self.caster = caster or Caster(twin.surface, threads)
+        self._illumination = Illumination(twin, self.caster)
+        self._exposure = np.asarray(exposure, np.float32)
+        self._normal_and_material = _normal_and_material(twin)
+
+    def edited(self, twin: Twin, exposure: Sequence[float] | float = 1.0) -> Renderer:
+        """The renderer of another edit of the same twin; what the edits have in common is not made again."""
+        other = copy(self)
+        other.twin, other._exposure = twin, np.asarray(exposure, np.float32)
+        other._illumination = Illumination(twin, self.caster, before=self._illumination)
+        if twin.materials is not self.twin.materials:
+            other._normal_and_material = _normal_and_material(twin)
+        vars(other).pop("_transmission", None)
+        return other
+
+    def view(self, T_world_camera: np.ndarray, mask: np.ndarray | None = None, exposure: float = 1.0) -> View:
+        """The view from ``T_world_camera`` [4, 4], of the pixels in ``mask`` [H, W] if given.
+
+        Colours of pixels at silhouettes and shadow edges (and of those beside the mask's edge), and only
+        those, are means over the pixel's area; labels are of its centre. ``exposure`` is a factor on the
+        radiance of this view.
+
+        Raises:
+            TrajectoryError: that is no rigid pose. OptionError: the mask has another shape than the image.
+        """
+        (T_world_camera,) = as_poses(T_world_camera)
+        shape = (self.camera.height, self.camera.width)
+        if mask is not None and np.shape(mask) != shape:
+            raise OptionError(f"the mask has the shape {np.shape(mask)}, but the image {shape}")
+        light = self._illumination.at(T_world_camera)
+        hits, normals, radiance, facing, visible = self._cast(self.camera, light, T_world_camera, mask)
+        radiance = laid_out(radiance, hits.pixel, shape)
+        distance_mm = laid_out(hits.distance_mm, hits.pixel, shape)
+        told = laid_out(facing, hits.pixel, shape)
+        edges = discontinuities(distance_mm) | ((distance_mm > 0) & ~told)
+        if visible is not None:
+            edges |= shadow_edges(laid_out(visible, hits.pixel, shape))
+        edges &= self._sees if mask is None else mask
+        mean, count = self._mean_radiance(np.argwhere(edges)[:, ::-1], light, T_world_camera)
+        radiance[edges] = np.where(count[:, None] > 0, mean, radiance[edges])
+        told[edges] |= count > 0
+        _close_slits(radiance, told, edges)
+        radiance *= self._exposure * exposure
+        if self._transmission is not None:
+            radiance *= self._transmission
+        color = shading.respond(torch.from_numpy(radiance), self.twin.response.gamma).clamp(0, 1).numpy()
+        return View(color, radiance, hits, shape, self, normals)
+
+    @property
+    def nbytes(self) -> int:
+        """Memory of what the effects keep between views, bytes."""
+        return self._illumination.nbytes
+
+    @cached_property
+    def _transmission(self) -> np.ndarray | None:
+        """Share of the light that the lens passes, float32 [H, W, 1]; None: all."""
+        if "vignetting" not in self.twin.effects:
+            return None
+        height, width = self.camera.height, self.camera.width
+        passed = self.twin.effects["vignetting"].transmission(self.camera, np.arange(height * width))
+        return passed.reshape(height, width, 1)
+
+    @cached_property
+    def _sees(self) -> np.ndarray:
+        """Bool [H, W]: pixels through which the lens sees at all."""
+        return np.isfinite(self.camera.pixel_directions).all(axis=2)
+
+    def _mean_radiance(
+        self, uv: np.ndarray, light: ViewLight, T_world_camera: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Radiance float32 [N, 3], averaged over the rays in the area of pixels ``uv`` [N, 2] that meet a
+        surface which faces them, and how many do, [N]."""
+        inside = (np.arange(SUBPIXELS) + 0.5) / SUBPIXELS - 0.5
+        offsets = np.stack(np.meshgrid(inside, inside), axis=-1).reshape(-1, 2)
+        rays = Rays(self.camera.directions(uv[:, None] + offsets).astype(np.float32))
+        hits, _, radiance, facing, _ = self._cast(rays, light, T_world_camera)
+        pixel = hits.pixel[facing]
+        total = laid_out(radiance[facing], pixel, (len(uv), len(offsets))).sum(axis=1)
+        count = np.bincount(pixel // len(offsets), minlength=len(uv)).astype(np.float32)
+        return total / np.maximum(count, 1)[:, None], count
+
+    def _cast(
+        self,
+        rays: Camera | Rays,
+        light: ViewLight,
+        T_world_camera: np.ndarray,
+        mask: np.ndarray | None = None,
+    ) -> tuple[Correspondences, np.ndarray, np.ndarray, np.ndarray, np.ndarray | None]:
+        """Hits [N], their unit normals in the camera frame [N, 3], their radiance [N, 3], whether they face
+        their ray [N], and which light guides they see [N, K] (None where no shadow is cast)."""
+        hits = self.caster.cast(rays, T_world_camera, mask)
+        mixed = hits.interpolate(self.twin.surface, self._normal_and_material)
+        normals = to_camera(mixed[:, :3], T_world_camera)
+        radiance, visible = light.radiance(
+            hits, rays.pixel_directions, normals, torch.from_numpy(mixed[:, 3:])
+        )
+        facing = -dot(normals, rays.pixel_directions.reshape(-1, 3).take(hits.pixel, axis=0)) > FACING
+        return hits, normals, radiance.numpy(), facing, visible
+
+
+def _normal_and_material(twin: Twin) -> np.ndarray:
+    """Normal, base colour, roughness and metallic of each vertex, float32 [V, 8]."""
+    materials = twin.materials
+    columns = [materials.base_color, materials.roughness[:, None], materials.metallic[:, None]]
+    return np.concatenate([twin.surface.normals, *columns], axis=1)
+
+
+def _close_slits(radiance: np.ndarray, told: np.ndarray, edges: np.ndarray) -> None:
+    """Give those of the ``edges`` [H, W] that lie in gaps, of one or two pixels, between those whose colour
+    is ``told`` [H, W] the mean ``radiance`` [H, W, 3] of the told ones about them.
+
+    Through such a slit, behind the rim of a fold, no depth map saw; but no surface is black.
+    """
+    closed = cv2.morphologyEx(told.view(np.uint8), cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8)) > 0
+    slits = np.nonzero(closed & ~told & edges)
+    if len(slits[0]):
+        count = cv2.boxFilter(told.astype(np.float32), -1, (3, 3), normalize=False)
+        total = cv2.boxFilter(radiance * told[..., None], -1, (3, 3), normalize=False)
+        radiance[slits] = total[slits] / np.maximum(count[slits], 1)[:, None]
+
+
+def shadow_edges(visible: np.ndarray) -> np.ndarray:
+    """Bool [H, W]: pixels beside which some guide is seen by one and not by another; ``visible`` [H, W,
+    K]."""
+    cross = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
+    edges = cv2.morphologyEx(np.ascontiguousarray(visible), cv2.MORPH_GRADIENT, cross)
+    return edges.reshape(*visible.shape).max(axis=2) > 0

@@ -1,0 +1,76 @@
+"""Readers of the sequence layouts in use, by name, and the door that all of them share."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import replace
+from pathlib import Path
+from types import ModuleType
+
+from endotwin.errors import OptionError, SequenceError
+from endotwin.sequence.readers import c3vd, simcol, transforms, tum
+from endotwin.sequence.sequence import Sequence
+
+__all__ = ["FORMATS", "open_sequence"]
+
+FORMATS: dict[str, ModuleType] = {"c3vd": c3vd, "transforms": transforms, "simcol": simcol, "tum": tum}
+
+LEAST_PX = 8
+"""Height and width below which an image that was made smaller shows nothing."""
+
+
+def open_sequence(path: Path | str, format: str | None = None, scale: float = 1.0) -> Sequence:
+    """Open a posed RGB-D sequence.
+
+    Args:
+        path: its folder, or its ``transforms.json``.
+        format: one of ``FORMATS``; detected from the content unless given.
+        scale: factor on the image size, at most 1; the camera is scaled with it.
+
+    Raises:
+        SequenceError: the folder, its files or its poses cannot be used; the message names file and remedy.
+        CameraError: the camera is unknown or impossible.
+        OptionError: there is no such format or scale.
+    """
+    if not isinstance(path, str | os.PathLike):
+        raise OptionError(f"a sequence is given by its folder, and not as {type(path).__name__}")
+    path = Path(path)
+    if format is not None and format not in FORMATS:
+        raise OptionError(f"There is no format {format!r}; choose one of {', '.join(FORMATS)}")
+    if scale > 1:
+        raise OptionError(f"A scale of {scale:g} enlarges the photos, which adds nothing; choose 1 or less")
+    if not path.exists():
+        raise SequenceError(f"There is no folder {path}; check the path")
+    reader = FORMATS[format] if format else _detected(path)
+    if path.is_file() and reader is not transforms:
+        raise SequenceError(f"{path} is a file; name the folder that holds the sequence")
+    if not reader.detects(path):
+        raise SequenceError(
+            f"{path} is not in the layout {format}, as it has no {reader.MARK}; name no format"
+        )
+    sequence = reader.read(path)
+    sequence.check()
+    if scale == 1:
+        return sequence
+    camera = sequence.camera.scaled(scale)
+    if min(camera.width, camera.height) < LEAST_PX:
+        raise OptionError(
+            f"A scale of {scale:g} leaves {camera.width}×{camera.height} pixels, too few; choose 0.5, say"
+        )
+    return replace(sequence, camera=camera, scale=scale)
+
+
+def _detected(path: Path) -> ModuleType:
+    for reader in FORMATS.values():
+        if reader.detects(path):
+            return reader
+    if path.is_dir() and not any(path.iterdir()):
+        raise SequenceError(f"{path} is empty and has no frames; name the folder that holds the photos")
+    inside = sorted(entry for entry in path.iterdir() if entry.is_dir()) if path.is_dir() else []
+    for folder in inside:
+        if any(reader.detects(folder) for reader in FORMATS.values()):
+            raise SequenceError(f"{path} has no frames itself, but {folder.name} in it has; name {folder}")
+    marks = ", ".join(f"{name} ({reader.MARK})" for name, reader in FORMATS.items())
+    raise SequenceError(
+        f"{path} has no frames in a known layout, which are {marks}; check it or name its format"
+    )

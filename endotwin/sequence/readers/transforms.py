@@ -1,0 +1,198 @@
+"""``transforms.json`` of nerfstudio and instant-ngp, with depth maps.
+
+Unit: positions are metres, as nerfstudio has it, unless the file says ``"unit": "mm"``; depth in that
+unit is the stored value times ``depth_unit_scale_factor`` (0.001 unless given: 16-bit millimetres beside
+positions in metres), or times instant-ngp's ``integer_depth_scale``. Depth is z-depth, 0 for none; PNG,
+TIFF, NPY, NPZ and OpenEXR are read. A frame's depth map is its ``depth_file_path`` (instant-ngp:
+``depth_path``), or else ``depth/NAME.*`` beside the photo's folder, or ``NAME_depth.*`` beside the photo.
+Where a frame's ``mask_path`` is 0, there is no depth. Principal points count from the image's edge, so half
+a pixel is subtracted.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import partial
+from math import isfinite, tan
+from pathlib import Path
+
+import numpy as np
+
+from endotwin.cameras import Camera, camera_from_dict
+from endotwin.errors import CameraError, SequenceError
+from endotwin.sequence.floatdepth import SUFFIXES, in_mm
+from endotwin.sequence.images import read_color, read_plane
+from endotwin.sequence.poses import frame_times, read_json, read_transforms_poses, transforms_unit_mm
+from endotwin.sequence.sequence import Sequence
+
+MARK = "transforms.json"
+COLOR_SUFFIXES = (".png", ".jpg", ".jpeg", ".tiff", ".tif")
+DEPTH_SUFFIXES = (".png", ".tiff", ".tif", *SUFFIXES)
+PINHOLES = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV")
+FISHEYE = "OPENCV_FISHEYE"
+INTRINSICS = (
+    "camera_model",
+    "is_fisheye",
+    "w",
+    "h",
+    "fl_x",
+    "fl_y",
+    "cx",
+    "cy",
+    "camera_angle_x",
+    "camera_angle_y",
+)
+DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
+DEPTH_SCALE = 0.001
+
+
+def detects(path: Path) -> bool:
+    """Whether ``path`` is a JSON file, or a folder with a ``transforms.json``."""
+    return path.suffix == ".json" if path.is_file() else (path / MARK).is_file()
+
+
+def read(path: Path) -> Sequence:
+    """The sequence of a ``transforms.json`` or of the folder that holds it, at its native size."""
+    file = path / MARK if path.is_dir() else path
+    content = read_json(file)
+    T_world_camera, frames = read_transforms_poses(file)
+    if not frames:
+        raise SequenceError(f"{file} has no frames; export the file again")
+    color_files = tuple(_color_file(file, frame) for frame in frames)
+    depth_files = tuple(_depth_file(file, *pair) for pair in zip(frames, color_files, strict=True))
+    level_mm = _depth_scale(file, content) * transforms_unit_mm(content, file)
+    return Sequence(
+        path=path,
+        format="transforms",
+        camera=_camera(file, content, frames, color_files[0]),
+        T_world_camera=T_world_camera,
+        color_files=color_files,
+        depth_files=depth_files,
+        read_depth_mm=partial(read_depth_mm, level_mm=level_mm, masks=_masks(file, frames, depth_files)),
+        timestamps_s=frame_times(len(frames)),
+    )
+
+
+def read_depth_mm(path: Path, level_mm: float, masks: Mapping[Path, Path] | None = None) -> np.ndarray:
+    """A depth map of any numeric type, float32 [H, W] in mm, ``level_mm`` a level; NaN where it is not
+    positive, and where the mask that goes with it is 0."""
+    raw = read_plane(path)
+    if raw.dtype == np.uint8:
+        raise SequenceError(f"{path} holds 8 bit, too coarse for depth; write 16-bit PNG or floating point")
+    depth_mm = in_mm(raw, level_mm)
+    if masks and path in masks:
+        mask = read_plane(masks[path])
+        if mask.shape != depth_mm.shape:
+            raise SequenceError(f"{masks[path]} is not of the size of {path.name}; give them the same size")
+        depth_mm[mask == 0] = np.nan
+    return depth_mm
+
+
+def _color_file(file: Path, frame: dict) -> Path:
+    name = frame.get("file_path")
+    if not isinstance(name, str):
+        raise SequenceError(f"{file} has a frame without 'file_path'; export the file again")
+    photo = file.parent / name
+    places = [photo, *(photo.with_name(photo.name + suffix) for suffix in COLOR_SUFFIXES)]
+    found = next((place for place in places if place.is_file()), None)
+    if found is None:
+        raise SequenceError(
+            f"{photo}, named in {file.name}, does not exist; add the photo or remove its frame"
+        )
+    return found
+
+
+def _depth_file(file: Path, frame: dict, photo: Path) -> Path:
+    named = frame.get("depth_file_path") or frame.get("depth_path")
+    if named:
+        depth = file.parent / str(named)
+        if not depth.is_file():
+            raise SequenceError(
+                f"{depth}, named in {file.name}, does not exist; add the depth map or remove its frame"
+            )
+        return depth
+    places = [
+        place
+        for suffix in DEPTH_SUFFIXES
+        for place in (
+            file.parent / "depth" / (photo.stem + suffix),
+            photo.parent.parent / "depth" / (photo.stem + suffix),
+            photo.with_name(photo.stem + "_depth" + suffix),
+        )
+    ]
+    found = next((place for place in places if place.is_file()), None)
+    if found is None:
+        raise SequenceError(
+            f"{photo} has no depth map; add depth/{photo.stem}.png or 'depth_file_path' to {file}"
+        )
+    return found
+
+
+def _masks(file: Path, frames: list[dict], depth_files: tuple[Path, ...]) -> dict[Path, Path]:
+    """Masks that frames name, by the depth map that each limits; nerfstudio leaves out pixels that are 0."""
+    masks = {}
+    for frame, depth in zip(frames, depth_files, strict=True):
+        if named := frame.get("mask_path"):
+            masks[depth] = file.parent / str(named)
+            if not masks[depth].is_file():
+                raise SequenceError(
+                    f"{masks[depth]}, named in {file.name}, does not exist; add the mask or remove its name"
+                )
+    return masks
+
+
+def _depth_scale(file: Path, content: dict) -> float:
+    scale = content.get("depth_unit_scale_factor", content.get("integer_depth_scale", DEPTH_SCALE))
+    if isinstance(scale, bool) or not isinstance(scale, int | float) or not 0 < scale < float("inf"):
+        raise SequenceError(f"{file}: 'depth_unit_scale_factor' is {scale!r}; set it to a positive number")
+    return scale
+
+
+def _camera(file: Path, content: dict, frames: list[dict], photo: Path) -> Camera:
+    """The one camera of all frames, its parameters at the top of the file or, all alike, in every frame."""
+    keys = INTRINSICS + DISTORTION
+    each = [{key: frame.get(key, content.get(key)) for key in keys} for frame in frames]
+    if any(parameters != each[0] for parameters in each):
+        raise CameraError(f"{file} has frames of different cameras; split it into a sequence for each camera")
+    given = {key: value for key, value in each[0].items() if value is not None}
+    for key in keys[2:]:
+        value = given.get(key, 1)
+        if isinstance(value, bool) or not isinstance(value, int | float) or not isfinite(value):
+            raise CameraError(f"{file}: {key!r} is {value!r}; set it to a finite number")
+    if "w" not in given or "h" not in given:
+        given["h"], given["w"] = read_color(photo).shape[:2]
+    return camera_from_dict(_description(file, given), file)
+
+
+def _description(file: Path, given: dict) -> dict:
+    """The content of a ``camera.json`` for the intrinsics that a ``transforms.json`` gives."""
+    model = given.get("camera_model", FISHEYE if given.get("is_fisheye") else "OPENCV")
+    distortion = {key: given.get(key, 0.0) for key in DISTORTION}
+    if model not in (*PINHOLES, FISHEYE):
+        known = ", ".join((*PINHOLES, FISHEYE))
+        raise CameraError(f"{file}: camera model {model!r} is unknown; set 'camera_model' to one of {known}")
+    if model == FISHEYE:
+        distortion = {key: distortion[key] for key in ("k1", "k2", "k3", "k4")}
+    elif distortion.pop("k4"):
+        raise CameraError(
+            f"{file}: 'k4' of a pinhole camera is not supported; undistort the images, or leave it out"
+        )
+    fl_x = given["fl_x"] if "fl_x" in given else _focal(given.get("camera_angle_x"), given["w"])
+    fl_y = given["fl_y"] if "fl_y" in given else _focal(given.get("camera_angle_y"), given["h"]) or fl_x
+    if not fl_x:
+        raise CameraError(f"{file} has neither 'fl_x' nor 'camera_angle_x'; add the focal length in pixels")
+    return {
+        "model": "fisheye" if model == FISHEYE else "pinhole",
+        "width": given["w"],
+        "height": given["h"],
+        "fx": fl_x,
+        "fy": fl_y,
+        "cx": given.get("cx", given["w"] / 2) - 0.5,
+        "cy": given.get("cy", given["h"] / 2) - 0.5,
+        **distortion,
+    }
+
+
+def _focal(angle: float | None, size: float) -> float | None:
+    """Focal length in pixels of a pinhole whose image of ``size`` pixels spans ``angle`` radians."""
+    return None if angle is None else size / 2 / tan(angle / 2)

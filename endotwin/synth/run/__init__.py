@@ -1,0 +1,1 @@
+"""A job becomes a dataset: who renders its shards, how they lie on disk, what is told about them."""

@@ -1,0 +1,153 @@
+"""Who renders the shards: this process, several of them, or a Dask cluster. The bytes do not depend on it."""
+
+from __future__ import annotations
+
+import logging
+import pickle
+from collections.abc import Iterable, Iterator
+from concurrent.futures import FIRST_COMPLETED, CancelledError, wait
+from contextlib import contextmanager
+from functools import cache
+from pathlib import Path
+from threading import Lock
+
+import torch
+from threadpoolctl import threadpool_limits
+
+from endotwin.errors import OptionError, OutputError
+from endotwin.run.processes import Pool
+from endotwin.synth.job import Job
+from endotwin.synth.labels import Labeller
+from endotwin.synth.run.shard import DONE, render_shard
+
+SCHEDULER_TIMEOUT_S = 15
+
+
+def render_here(job: Job, folder: Path, shards: Iterable[int]) -> Iterator[int]:
+    """Render in this process, one shard after the other."""
+    with _one_core():
+        labeller = Labeller(job)
+        for number in shards:
+            render_shard(job, labeller, folder, number)
+            yield number
+
+
+def render_in_processes(job: Job, folder: Path, shards: Iterable[int], workers: int) -> Iterator[int]:
+    """Render in so many processes, each of which reads the job once; the shards' numbers as they come."""
+    sent = folder / DONE / "job.pickle"
+    with sent.open("wb") as file:
+        pickle.dump(job, file, pickle.HIGHEST_PROTOCOL)
+    with Pool(workers, _enlist, sent, folder) as pool:
+        tasks = {pool.submit(_work, number): number for number in shards}
+        while tasks:
+            for task in wait(tasks, return_when=FIRST_COMPLETED).done:
+                task.result()
+                yield tasks.pop(task)
+
+
+def render_on_cluster(job: Job, folder: Path, shards: Iterable[int], scheduler: str) -> Iterator[int]:
+    """Render on the workers of a Dask scheduler, which must see ``folder`` too; their numbers as they come.
+
+    Raises:
+        OptionError: Dask is not installed, no scheduler answers, or its workers write elsewhere.
+    """
+    try:
+        from distributed import Client, KilledWorker, as_completed
+        from distributed.comm import resolve_address
+    except ImportError as error:
+        raise OptionError(
+            "a scheduler needs Dask; install it with pip install 'endotwin[cluster]'"
+        ) from error
+    try:
+        resolve_address(scheduler)
+        client = Client(scheduler, timeout=SCHEDULER_TIMEOUT_S, set_as_default=False)
+    except (OSError, ValueError, TimeoutError) as error:
+        raise OptionError(f"no Dask scheduler answers at {scheduler!r}; check the address") from error
+    with _silent("distributed"), client, client.as_current():
+        if not client.scheduler_info(n_workers=-1)["workers"]:
+            raise OptionError(
+                f"the Dask scheduler at {scheduler} has no workers; start some with 'dask worker'"
+            )
+        sent = client.scatter(job, broadcast=True, hash=False)
+        tasks = [client.submit(_work_for, sent, folder.absolute(), number, pure=False) for number in shards]
+        try:
+            for task in as_completed(tasks):
+                number = task.result()
+                if not (folder / DONE / f"{number:06d}.json").is_file():
+                    raise OptionError(
+                        f"the workers of {scheduler} do not write to {folder.absolute()}; put the dataset "
+                        f"on a disk "
+                        "that they share"
+                    )
+                yield number
+                task.release()
+        except (CancelledError, KilledWorker) as error:
+            raise OutputError(
+                f"the Dask scheduler at {scheduler} or its workers were lost; start them again"
+            ) from error
+        finally:
+            client.cancel(tasks)
+
+
+@contextmanager
+def _silent(library: str) -> Iterator[None]:
+    """What goes wrong in the block is told by our own errors, not by the library's log as well."""
+    names = [name for name in logging.root.manager.loggerDict if name.partition(".")[0] == library]
+    loud = [logger for logger in map(logging.getLogger, names) if not logger.disabled]
+    for logger in loud:
+        logger.disabled = True
+    try:
+        yield
+    finally:
+        for logger in loud:
+            logger.disabled = False
+
+
+# In the worker
+
+_bench: tuple[Job, Labeller, Path] | None = None
+_building = Lock()
+
+
+def _enlist(sent: Path, folder: Path) -> None:
+    """Make this process a worker for the job in the file ``sent``."""
+    global _bench
+    _keep_to_one_core()
+    job = pickle.loads(sent.read_bytes())
+    _bench = (job, Labeller(job), folder)
+
+
+def _work(number: int) -> None:
+    job, labeller, folder = _bench
+    render_shard(job, labeller, folder, number)
+
+
+def _work_for(job: Job, folder: Path, number: int) -> int:
+    """Render a shard in a Dask worker, which keeps the labeller of its latest job."""
+    global _bench
+    with _building:
+        if _bench is None or _bench[0] is not job:
+            _keep_to_one_core()
+            _bench = (job, Labeller(job), folder)
+        labeller = _bench[1]
+    render_shard(job, labeller, folder, number)
+    return number
+
+
+@cache
+def _keep_to_one_core() -> None:
+    """Torch and BLAS keep to the calling thread: with threads of their own, a frame takes 4 times as long."""
+    torch.set_num_threads(1)
+    threadpool_limits(1, user_api="blas")
+
+
+@contextmanager
+def _one_core() -> Iterator[None]:
+    """``_keep_to_one_core`` for the block."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        with threadpool_limits(1, user_api="blas"):
+            yield
+    finally:
+        torch.set_num_threads(before)

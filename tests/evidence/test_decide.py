@@ -1,0 +1,152 @@
+"""Which effects are called for, on sequences that an independent path tracer made."""
+
+import os
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from endotwin.config import STANDARD
+from endotwin.effects.vignetting import Vignetting
+from endotwin.evidence.decide import decide
+from endotwin.evidence.probe import Hypothesis, Probe
+from endotwin.pipeline import fuse_twin
+from endotwin.pixels.pace import Pace
+from endotwin.pixels.samples import gather
+from endotwin.surface.casting import Caster
+
+pytestmark = pytest.mark.slow
+
+EXAMPLE = Path(__file__).parents[2] / "examples" / "colon_small"
+DATA = Path(os.environ.get("ENDOTWIN_DATA", "nowhere"))
+needs_data = pytest.mark.skipif(not DATA.is_dir(), reason="ENDOTWIN_DATA names no folder")
+LIGHT = ("offset", "shadows", "interreflection", "gain", "vignetting", "profile")
+
+
+def scene(path: Path, scale: float):
+    """A fused twin of the sequence, a caster of its mesh, and the pixels that a fit would look at."""
+    twin = fuse_twin(path, scale=scale)
+    caster = Caster(twin.surface)
+    samples = gather(twin, Pace(STANDARD.fit), 0, caster)
+    smooth = twin.surface.normal_agreement() > np.cos(np.radians(5))
+    telling = smooth[samples.triangle.numpy()] & (samples.color.numpy().max(axis=1) < 250)
+    return twin, caster, samples[torch.from_numpy(np.flatnonzero(telling))]
+
+
+@pytest.fixture(scope="module")
+def example():
+    return scene(EXAMPLE, 1.0)
+
+
+def states(decided) -> dict[str, str]:
+    return {name: decided.decisions[name].state for name in LIGHT}
+
+
+def brightened(samples, log_gain: np.ndarray):
+    """The samples as a camera of gamma 2.2 would have shown them with a gain of each frame."""
+    frame = samples.frame.numpy()
+    factor = np.exp(log_gain[frame] / 2.2)[:, None]
+    color = np.clip(samples.color.numpy() * factor, 0, 255)
+    return replace(samples, color=torch.from_numpy(np.uint8(color + 0.5)))
+
+
+def test_a_scene_lit_as_in_the_paper_calls_for_no_effect(example):
+    twin, caster, samples = example
+    assert set(states(decide(samples, twin, caster, {})).values()) == {"off"}
+
+
+def test_gain_is_found_to_a_hundredth(example):
+    twin, caster, samples = example
+    log_gain = np.random.default_rng(3).normal(0, 0.15, 64)
+    decided = decide(brightened(samples, log_gain), twin, caster, {})
+    assert states(decided) == {**dict.fromkeys(LIGHT, "off"), "gain": "on"}
+    gain = decided.effects["gain"]
+    true = log_gain[list(gain.frames)]
+    assert np.abs(np.array(gain.log_gain) - (true - true.mean())).max() < 0.02
+
+
+def test_an_effect_is_not_kept_beside_a_light_that_no_endoscope_has(example):
+    twin, caster, samples = example
+    log_gain = np.random.default_rng(3).normal(0, 0.15, 64)
+    probe = Probe(brightened(samples, log_gain), twin, caster)
+    plain, gained = probe.fit(Hypothesis()), probe.fit(Hypothesis(gain=True))
+    assert probe.compare(plain, gained).keep
+    towards_the_sides = replace(gained.effects, coefficients=gained.effects.coefficients * [-1, 1, 1])
+    assert not probe.compare(plain, replace(gained, effects=towards_the_sides)).keep
+
+
+def test_a_profile_that_is_no_cosine_is_found(example):
+    twin, caster, samples = example
+    cos_axis = samples.log_cos_axis.exp().numpy()
+    factor = (np.exp(-4 * (1 - cos_axis)) / cos_axis**2) ** (1 / 2.2)
+    color = np.uint8(np.clip(samples.color.numpy() * factor[:, None], 0, 255) + 0.5)
+    decided = decide(replace(samples, color=torch.from_numpy(color)), twin, caster, {})
+    assert states(decided) == {**dict.fromkeys(LIGHT, "off"), "profile": "on"}
+    assert decided.light.n == pytest.approx(4, rel=0.05)
+    assert decided.effects["profile"].exponential == pytest.approx(1, abs=0.1)
+
+
+def test_a_profile_forced_on_a_cosine_stays_one(example):
+    twin, caster, samples = example
+    decided = decide(samples, twin, caster, {"profile": "on"})
+    assert states(decided) == {**dict.fromkeys(LIGHT, "off"), "profile": "on"}
+    assert decided.effects["profile"].exponential == pytest.approx(0, abs=0.1)
+    assert decided.light.n == pytest.approx(2, rel=0.05)
+
+
+def test_an_effect_that_is_forced_off_stays_off(example):
+    twin, caster, samples = example
+    log_gain = np.random.default_rng(3).normal(0, 0.15, 64)
+    decided = decide(brightened(samples, log_gain), twin, caster, {"gain": "off"})
+    assert decided.decisions["gain"].state == "off"
+    assert decided.decisions["gain"].reason == "forced off"
+
+
+@needs_data
+def test_interreflection_turns_itself_on_in_a_tube_that_has_it():
+    decided = decide(*reordered(scene(DATA / "colon_gi", 0.5)), {})
+    assert states(decided) == {**dict.fromkeys(LIGHT, "off"), "interreflection": "on"}
+
+
+@pytest.fixture(scope="module")
+def lit_from_beside():
+    return scene(DATA / "colon_offset", 0.5)
+
+
+GUIDES_MM = [[-2.5, 1.0, 0.0], [2.5, 0.0, 0.0]]
+
+
+@needs_data
+def test_guides_are_found_within_half_a_millimetre_with_their_shadows(lit_from_beside):
+    decided = decide(*reordered(lit_from_beside), {})
+    assert states(decided) == {**dict.fromkeys(LIGHT, "off"), "offset": "on", "shadows": "on"}
+    np.testing.assert_allclose(sorted(decided.effects["offset"].guides_mm), GUIDES_MM, atol=0.5)
+
+
+@needs_data
+def test_vignetting_and_guides_are_told_apart(lit_from_beside):
+    twin, caster, samples = lit_from_beside
+    true = Vignetting(-0.5, -0.1)
+    decided = decide(vignetted(samples, twin, true), twin, caster, {})
+    on = dict.fromkeys(("offset", "shadows", "vignetting"), "on")
+    assert states(decided) == {**dict.fromkeys(LIGHT, "off"), **on}
+    np.testing.assert_allclose(sorted(decided.effects["offset"].guides_mm), GUIDES_MM, atol=0.5)
+    # Cosines of the profile can stand in for k2, so that only what the two pass together is told.
+    r2 = np.linspace(0, 1, 50)
+    cosine = -np.log1p(r2 * (0.5 / 0.6) ** 2) / 2
+    found = decided.effects["vignetting"]
+    passed = decided.light.n * cosine + found.k2 * r2 + found.k4 * r2**2
+    np.testing.assert_allclose(passed, cosine + true.k2 * r2 + true.k4 * r2**2, atol=0.03)
+
+
+def vignetted(samples, twin, vignetting: Vignetting):
+    """The samples as a lens with ``vignetting`` and a camera of gamma 2.2 would have shown them."""
+    passed = vignetting.transmission(twin.camera, samples.pixel.numpy()) ** (1 / 2.2)
+    return replace(samples, color=torch.from_numpy(np.uint8(samples.color.numpy() * passed[:, None] + 0.5)))
+
+
+def reordered(made):
+    twin, caster, samples = made
+    return samples, twin, caster

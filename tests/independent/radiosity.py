@@ -1,0 +1,152 @@
+"""Diffuse light between all parts of a wall, to the end of its bounces.
+
+Patches are blocks of the grid. E = K·ρ·(E_direct + E) with K the share of a patch's cosine-weighted rays that
+end on each other patch (Goral et al. 1984). From patch to patch all reflection is diffuse.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.sparse
+
+from independent.light import Lamp, dot
+from independent.wall import Wall, sampled, unit
+
+BLOCK = 4
+"""Quads of a patch, each way."""
+
+STRATA = 24
+"""Rays of a patch: their squared number, one in each cell of the unit square."""
+
+AT_ONCE = 512
+LIFT = 1e-4
+CONVERGED = 1e-4
+MOST_BOUNCES = 200
+
+
+@dataclass(frozen=True)
+class Bounce:
+    """Indirect irradiance and radiosity of patches in F frames, float32 [F, R, C, 3]."""
+
+    arriving: np.ndarray
+    leaving: np.ndarray
+
+    def at(self, frame: int, place: np.ndarray, mirrored: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Indirect irradiance at places [N, 2] of the wall, and radiosity at places [N, 2] that they mirror;
+        interpolated between patches' centres."""
+        return (
+            sampled(self.arriving[frame], place / BLOCK - 0.5),
+            sampled(self.leaving[frame], mirrored / BLOCK - 0.5),
+        )
+
+
+class Radiosity:
+    """Patches of a wall, [R, C] of them, with the map ``tissue`` [H, W, K] over it.
+
+    Attributes:
+        shape: R, C. tissue: float32 [P, K], means over the patches.
+        patch_of: int [T], patch of each triangle. form_factors: CSR [P, P]; a row sums to 1 where the wall is
+        closed.
+    """
+
+    def __init__(self, wall: Wall, tissue: np.ndarray, rng: np.random.Generator):
+        self._wall = wall
+        self.shape = ((wall.shape[0] - 1) // BLOCK, wall.shape[1] // BLOCK)
+        corners = wall.vertices_mm[wall.triangles]
+        self._centres_mm = corners.mean(axis=1)
+        self._normals = unit(wall.doubled_area).astype(np.float32)
+        area = np.sqrt((wall.doubled_area**2).sum(axis=1))
+        self._triangles = self._of_blocks()
+        share = area[self._triangles]
+        self._share = (share / np.maximum(share.sum(axis=1, keepdims=True), 1e-20)).astype(np.float32)
+        self.patch_of = np.empty(len(area), np.int64)
+        self.patch_of[self._triangles] = np.arange(len(self._triangles))[:, None]
+        self.form_factors = self._counted(corners, rng)
+        rows, columns = np.divmod(np.arange(len(area)) // 2, wall.shape[1])
+        scale = (tissue.shape[0] - 1) / (wall.shape[0] - 1)
+        texels = sampled(tissue, scale * np.stack([rows + 0.5, columns + 0.5], axis=1))
+        self.tissue = self._mean(texels).astype(np.float32)
+
+    def direct(self, lamp: Lamp, pose: np.ndarray) -> np.ndarray:
+        """Irradiance float32 [P] that the lamp of a camera at ``pose`` [4, 4] throws on the patches."""
+        rotation, centre = pose[:3, :3], pose[:3, 3]
+        points_mm = (self._centres_mm - centre) @ rotation
+        normals = self._normals @ rotation
+        total = np.zeros(len(points_mm))
+        for guide, guide_mm in enumerate(lamp.guides_mm):
+            strength, to_light = lamp.arriving(guide, points_mm)
+            strength = strength * np.maximum(dot(normals, to_light), 0)
+            lit = np.flatnonzero(strength > 0)
+            source_mm = centre + rotation @ np.asarray(guide_mm)
+            lit = lit[self._wall.sees(source_mm, self._centres_mm[lit])]
+            total[lit] += strength[lit]
+        return self._mean(total[:, None])[:, 0].astype(np.float32)
+
+    def bounce(self, direct: np.ndarray, albedo: np.ndarray) -> Bounce:
+        """All light between patches [P] of ``albedo`` [P, 3] for direct irradiance [P, F]."""
+        albedo = albedo[:, None].astype(np.float32)
+        source = albedo * direct[..., None]
+        arriving = np.zeros_like(source)
+        for _ in range(MOST_BOUNCES):
+            leaving = source + albedo * arriving
+            before = arriving
+            arriving = (self.form_factors @ leaving.reshape(len(direct), -1)).reshape(source.shape)
+            if np.abs(arriving - before).max() <= CONVERGED * arriving.max():
+                break
+        return Bounce(*(np.moveaxis(x, 1, 0).reshape(-1, *self.shape, 3) for x in (arriving, leaving)))
+
+    def _of_blocks(self) -> np.ndarray:
+        """Triangles int [P, 2·BLOCK²] of each patch."""
+        quads = np.arange((self._wall.shape[0] - 1) * self._wall.shape[1])
+        quads = quads.reshape(self.shape[0], BLOCK, self.shape[1], BLOCK).swapaxes(1, 2).reshape(-1, BLOCK**2)
+        return np.concatenate([2 * quads, 2 * quads + 1], axis=1)
+
+    def _mean(self, values: np.ndarray) -> np.ndarray:
+        """Means [P, C] over the patches' areas of values [T, C] of triangles."""
+        return np.einsum("pt,ptc->pc", self._share, values[self._triangles])
+
+    def _counted(self, corners: np.ndarray, rng: np.random.Generator) -> scipy.sparse.csr_array:
+        count, each = len(self._triangles), STRATA**2
+        cell = np.stack(np.divmod(np.arange(each), STRATA), axis=1)
+        member = np.arange(each) % self._triangles.shape[1]
+        repeats = each / self._triangles.shape[1]
+        scale_mm = float(np.ptp(self._centres_mm, axis=0).max())
+        parts = []
+        for first in range(0, count, AT_ONCE):
+            patches = np.arange(first, min(first + AT_ONCE, count))
+            triangle = self._triangles[patches][:, member].ravel()
+            weight = self._share[patches][:, member].ravel() / repeats
+            draw = rng.random((len(patches), each, 4), np.float32)
+            draw[..., :2] = (cell + draw[..., :2]) / STRATA
+            draw = draw.reshape(-1, 4)
+            normal = self._normals[triangle]
+            direction = cosine_weighted(normal, draw[:, 0], draw[:, 1])
+            origin = inside(corners[triangle], draw[:, 2], draw[:, 3]) + LIFT * scale_mm * normal
+            hit = self._wall.hit_triangle(origin, direction)
+            landed = np.flatnonzero(hit >= 0)
+            place = (np.repeat(patches - first, each)[landed], self.patch_of[hit[landed]])
+            part = scipy.sparse.coo_array((weight[landed], place), shape=(len(patches), count))
+            parts.append(part.tocsr())
+        return scipy.sparse.vstack(parts, format="csr")
+
+
+def cosine_weighted(normals: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """Directions [N, 3] about unit normals with density cosθ/π for u, v in [0, 1): Malley's method, in the
+    basis of Duff et al. 2017."""
+    radius, angle = np.sqrt(u), 2 * np.pi * v
+    x, y, z = radius * np.cos(angle), radius * np.sin(angle), np.sqrt(1 - u)
+    sign = np.where(normals[:, 2] < 0, -1, 1)
+    a = -1 / (sign + normals[:, 2])
+    b = normals[:, 0] * normals[:, 1] * a
+    first = np.stack([1 + sign * normals[:, 0] ** 2 * a, sign * b, -sign * normals[:, 0]], axis=1)
+    second = np.stack([b, sign + normals[:, 1] ** 2 * a, -normals[:, 1]], axis=1)
+    return x[:, None] * first + y[:, None] * second + z[:, None] * normals
+
+
+def inside(corners: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """Points [N, 3] spread evenly over triangles [N, 3, 3] for u, v in [0, 1) (Turk 1990)."""
+    root = np.sqrt(u)[:, None]
+    a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
+    return (1 - root) * a + root * (1 - v[:, None]) * b + root * v[:, None] * c

@@ -1,0 +1,62 @@
+"""Bounced light at points, against what an integrating sphere makes of it."""
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from endotwin.fusion.mesh import surface_of
+from endotwin.light.bounced import Albedo, BouncedLight, Places
+from endotwin.light.guides import AT_LENS, COSINE
+from endotwin.light.radiosity import BOUNCES, Radiosity
+from endotwin.light.shading import specular_albedo
+from endotwin.surface.casting import Caster
+
+RADIUS_MM = 10.0
+BASE_COLOR, ROUGHNESS, F0 = 0.5, 0.4, 0.04
+GLOSSY = float(specular_albedo(torch.tensor(ROUGHNESS), F0))
+
+
+@pytest.fixture(scope="module")
+def sphere() -> tuple[BouncedLight, Places, Albedo]:
+    """Light at the centre of a hollow sphere in two views, seen at its vertices in turns."""
+    ball = trimesh.creation.icosphere(subdivisions=5, radius=RADIUS_MM)
+    surface = surface_of(np.zeros(3), np.asarray(ball.vertices, np.float32), ball.faces[:, ::-1])
+    radiosity = Radiosity(surface, Caster(surface), cell_mm=3.0)
+    count = len(surface.vertices_mm)
+    color, roughness = torch.full((count, 3), BASE_COLOR), torch.full((count,), ROUGHNESS)
+    albedo = Albedo.of(radiosity, color, roughness, F0, surface.triangles)
+    light = BouncedLight(radiosity, np.tile(np.eye(4), (2, 1, 1)), AT_LENS, COSINE)
+    return light, Places(radiosity.to_vertex, np.arange(count) % 2), albedo
+
+
+def series(albedo: float) -> float:
+    """E/E_direct = ρ + ρ² + …, cut after BOUNCES terms (Ulbricht's integrating sphere)."""
+    return sum(albedo**k for k in range(1, BOUNCES + 1))
+
+
+def test_base_color_and_gloss_both_send_light_back(sphere):
+    light, places, albedo = sphere
+    bounced = light.at(places, n=0.0, q=2.0, albedo=albedo.scaled(0.0))
+    np.testing.assert_allclose(bounced, series(BASE_COLOR + GLOSSY) / RADIUS_MM**2, rtol=0.03)
+    brighter = light.at(places, n=0.0, q=2.0, albedo=albedo.scaled(0.3))
+    np.testing.assert_allclose(brighter, series(BASE_COLOR * np.exp(0.3) + GLOSSY) / RADIUS_MM**2, rtol=0.03)
+
+
+def test_one_view_is_as_one_of_several(sphere):
+    light, places, albedo = sphere
+    several = light.at(places, 1.0, 2.0, albedo.scaled(0.0))
+    alone = Places(places.weights, 0 * places.view).of(np.ones((places.weights.shape[1], 1, 3)))
+    np.testing.assert_allclose(alone, 1, rtol=1e-6)
+    np.testing.assert_allclose(several[::2].mean(), several[1::2].mean(), rtol=0.01)
+
+
+def test_the_expansion_is_exact_where_it_was_made_and_follows_the_light(sphere):
+    light, places, albedo = sphere
+    gloss = torch.zeros(len(places.view))
+    bounce = light.expanded(places, 0.5, 2.0, albedo, gloss, log_scale=0.1)
+    here = light.at(places, 0.5, 2.0, albedo.scaled(0.1))
+    np.testing.assert_allclose(bounce.irradiance(0.5, 2.0, 0.1), here, rtol=1e-4)
+    np.testing.assert_allclose(bounce.by_q, -np.log(RADIUS_MM), rtol=0.01)
+    moved = light.at(places, 0.55, 1.95, albedo.scaled(0.15))
+    np.testing.assert_allclose(bounce.irradiance(0.55, 1.95, 0.15), moved, rtol=0.01)

@@ -1,0 +1,27 @@
+"""Which effects a fit finds in small scenes of the independent renderer."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from independent.lens import Lens
+from independent.scene import EFFECTS, Scene
+from independent.write import make
+
+import endotwin
+from endotwin.twin import Twin
+
+
+def fitted(folder: Path, seed: int, effects: set[str]) -> tuple[Twin, dict]:
+    """The twin of a seed's scene with these effects, at 160×120, and the scene's truth."""
+    scene = Scene.draw(seed).having(frozenset(effects))
+    made = make(replace(scene, lens=Lens.pinhole(160, 120, 100), frames=9), folder)
+    return endotwin.fit_twin(endotwin.fuse_twin(folder)), made
+
+
+@pytest.mark.parametrize(("seed", "effects"), [(12, {"gain"}), (13, {"profile"})], ids=["gain", "profile"])
+def test_a_fit_finds_what_a_scene_has_and_nothing_else(tmp_path: Path, seed: int, effects: set[str]) -> None:
+    twin, made = fitted(tmp_path, seed, effects)
+    assert {name for name in EFFECTS if twin.decisions[name].state == "on"} == effects
+    assert all(shown["levels"] > 1 for shown in made["shown"].values())
+    assert twin.response.gamma == pytest.approx(made["gamma"], rel=0.04)

@@ -1,0 +1,108 @@
+"""What the renderer shows is what the fit predicts, whatever lights the scene."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import tube_twin
+
+from endotwin.effects import Effects
+from endotwin.effects.coat import Coat
+from endotwin.effects.gain import Gain
+from endotwin.effects.interreflection import Interreflection
+from endotwin.effects.offset import Offset
+from endotwin.effects.profile import Profile
+from endotwin.effects.shadows import Shadows
+from endotwin.effects.specular import Specular
+from endotwin.effects.vignetting import Vignetting
+from endotwin.fit.gauss_newton import GaussNewton
+from endotwin.fit.lighting import Relighting, lit
+from endotwin.fit.model import Globals, at_pixels, predict
+from endotwin.light.guides import visible_from
+from endotwin.render import Renderer
+from endotwin.render.renderer import laid_out, shadow_edges
+from endotwin.surface.casting import Caster
+from endotwin.surface.silhouettes import discontinuities
+from endotwin.twin import Twin
+
+GUIDES = Offset(((3.2, 0.5, 0.0), (-2.8, 2.7, 0.0)))
+SCENES = {
+    "light": [],
+    "gain": [Gain((0, 1), (-0.2, 0.2))],
+    "vignetting": [Vignetting(-0.5, -0.1)],
+    "profile": [Profile(0.7)],
+    "offset and shadows": [GUIDES, Shadows()],
+    "interreflection": [Interreflection(4.0)],
+    "coat": [Coat(0.8, 0.15)],
+    "all": [
+        GUIDES,
+        Shadows(),
+        Interreflection(4.0),
+        Gain((0, 1), (-0.2, 0.2)),
+        Vignetting(-0.5, -0.1),
+        Profile(0.7),
+        Coat(0.8, 0.15),
+    ],
+}
+POSES = np.stack([tube_twin.pose(0.3), tube_twin.pose(0.6)])
+LEVEL = 1 / 255
+
+
+@pytest.fixture(scope="module")
+def tube() -> Twin:
+    """A folded tube without metallic, which a fit does not have."""
+    twin = tube_twin.fitted(tube_twin.seen(tube_twin.surface(fold_mm=2.0)))
+    return replace(twin, materials=replace(twin.materials, metallic=0 * twin.materials.metallic))
+
+
+@pytest.mark.parametrize("scene", SCENES)
+def test_the_renderers_pixels_are_what_the_fit_predicts(tube, scene):
+    effects = Effects([Specular(), *SCENES[scene]])
+    twin, caster = replace(tube, effects=effects), Caster(tube.surface)
+    samples, state = tube_twin.photographed(tube, tube.camera, POSES), tube_twin.state_of(tube)
+    shared = Globals.of(twin.light, twin.response, twin.materials.f0, bounce=bool(effects.bounce))
+    state = replace(state, shared=replace(shared, coat=effects.get("coat")))
+    # The fit would find its own gains again, of photos without one.
+    relighting = Relighting(tube.surface, caster, effects.without(["gain"]), samples.views)
+    solver = GaussNewton(lit(samples, tube.surface, caster, effects), tube.surface.triangles, state.operator)
+    relighting(solver, state)
+    material = at_pixels(solver.samples, solver.triangles, state.materials)
+    predicted = predict(solver.samples, material, state.shared).clamp(0, 1).numpy()
+
+    renderer, compared = Renderer(twin), 0
+    for frame, pose in enumerate(POSES):
+        gain = float(effects["gain"].of(np.array([frame]))[0]) if "gain" in effects else 1.0
+        view = renderer.view(pose, exposure=gain)
+        rows = np.flatnonzero(samples.frame.numpy() == frame)
+        pixel = samples.pixel.numpy()[rows]
+        inner = ~averaged(view, renderer, pose).ravel()[pixel]
+        apart = np.abs(view.color.reshape(-1, 3)[pixel] - predicted[rows])[inner]
+        compared += len(apart)
+        # Of bounced light the fit has the nearest vertex's, and the renderer what lies between three.
+        assert np.quantile(apart, 0.999 if effects.bounce else 1.0) < LEVEL
+        assert np.median(apart) < 0.1 * LEVEL
+    assert compared > 0.75 * len(samples)
+
+
+def averaged(view, renderer: Renderer, pose: np.ndarray) -> np.ndarray:
+    """Bool [H, W]: pixels that the renderer shows as means of several rays, where the fit has one."""
+    distance_mm = view.image(view.hits.distance_mm)
+    edges = discontinuities(distance_mm)
+    effects = renderer.twin.effects
+    if "shadows" in effects:
+        directions = renderer.camera.pixel_directions.reshape(-1, 3)
+        points_mm = directions[view.hits.pixel] * view.hits.distance_mm[:, None]
+        T_local_camera = renderer.twin.surface.to_local(pose)
+        seen = visible_from(renderer.caster, T_local_camera, points_mm, np.array(effects.guides_mm))
+        edges |= shadow_edges(laid_out(seen, view.hits.pixel, view.shape))
+    return edges
+
+
+@pytest.mark.parametrize("scene", [name for name in SCENES if name not in ("light", "gain")])
+def test_each_of_these_effects_shows(tube, scene):
+    """Else their agreement would say nothing."""
+    plain, with_it = (
+        Renderer(replace(tube, effects=Effects([Specular(), *more]))).view(POSES[0]).color
+        for more in ([], SCENES[scene])
+    )
+    assert np.abs(plain - with_it).max() > 2 * LEVEL

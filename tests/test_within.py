@@ -1,0 +1,112 @@
+"""Light, response and f0 from the variation within vertices, whatever the tissue's texture."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from endotwin.effects import Decision
+from endotwin.effects.coat import Coat
+from endotwin.evidence.coat import judged
+from endotwin.fit.model import Globals, predict
+from endotwin.fit.within import Within
+from endotwin.pixels.samples import Samples
+from endotwin.twin import Light, Response
+
+VERTICES, SIGHTINGS = 600, 40
+TRUE = Globals.of(Light(120.0, 1.7, 2.2), Response(0.42), f0=0.035)
+ROUGHNESS = 0.45
+NOISE = 1 / 255
+
+
+def photographed(true: Globals = TRUE, seed: int = 0) -> tuple[Within, torch.Tensor]:
+    """8-bit photos of vertices with random albedo, a fifth near the mirror direction; and the materials."""
+    generator = np.random.default_rng(seed)
+    count = VERTICES * SIGHTINGS
+    vertex = np.repeat(np.arange(VERTICES), SIGHTINGS)
+    cos = generator.uniform(0.25, 0.92, count)
+    shiny = generator.random(count) < 0.2
+    cos[shiny] = generator.uniform(0.97, 0.999, shiny.sum())
+    albedo = generator.uniform(0.1, 0.8, (VERTICES, 3))[vertex]
+    material = torch.from_numpy(np.c_[albedo, np.full(count, ROUGHNESS)])
+    samples = Samples(
+        triangle=torch.from_numpy(vertex),
+        barycentric=torch.tensor([[0.8, 0.1, 0.1]]).repeat(count, 1),
+        cos=torch.from_numpy(cos),
+        sin2=torch.from_numpy(1 - cos**2),
+        log_cos_axis=torch.from_numpy(np.log(generator.uniform(0.5, 1, count))),
+        log_distance=torch.from_numpy(np.log(generator.uniform(12, 40, count))),
+        color=torch.zeros(count, 3, dtype=torch.uint8),
+        frame=torch.from_numpy(np.tile(np.arange(SIGHTINGS, dtype=np.int32), VERTICES)),
+        pixel=torch.zeros(count, dtype=torch.int32),
+    )
+    shown = predict(samples, material, true).numpy() + generator.normal(0, NOISE, (count, 3))
+    color = torch.from_numpy(np.uint8(np.clip(shown, 0, 1) * 255 + 0.5))
+    return Within(replace(samples, color=color), vertex, VERTICES, 1.0), material
+
+
+def told(shared: Globals) -> list[float]:
+    return [shared.gamma, *shared.log_light[1:], shared.f0]
+
+
+@pytest.mark.parametrize("gamma, n, q", [(0.45, 2.0, 2.0), (0.6, 1.0, 1.5), (0.3, 3.0, 2.8)])
+def test_light_response_and_f0_are_found_beside_an_albedo_that_is_nowhere_right(gamma, n, q):
+    within, material = photographed()
+    grey = material.clone()
+    grey[:, :3] = 0.4
+    shared = Globals.of(Light(120.0, n, q), Response(gamma), f0=0.06)
+    for _ in range(8):
+        shared = within.renewed(grey, shared, (), NOISE)
+    assert told(shared)[:3] == pytest.approx(told(TRUE)[:3], rel=0.02)
+    for _ in range(4):
+        shared = within.renewed(material, shared, (), NOISE)
+    assert told(shared) == pytest.approx(told(TRUE), rel=0.01)
+
+
+def test_a_coat_is_found_with_its_roughness_and_weight():
+    within, material = photographed(replace(TRUE, coat=Coat(0.8, 0.19)))
+    coat, decision = judged(within.highlights(material, TRUE, NOISE), "auto")
+    assert decision.state == "on" and coat.roughness == 0.19
+    shared = replace(TRUE, coat=coat)
+    for _ in range(6):
+        shared = within.renewed(material, shared, (), NOISE)
+    assert shared.coat.weight == pytest.approx(0.8, rel=0.05)
+    assert told(shared) == pytest.approx(told(TRUE), rel=0.02)
+
+
+def test_tissue_without_a_coat_gets_none_and_one_that_is_forced_on_weighs_nothing():
+    within, material = photographed()
+    assert judged(within.highlights(material, TRUE, NOISE), "auto")[0] is None
+    assert judged(within.highlights(material, TRUE, NOISE), "off") == (None, Decision("off", "forced off"))
+    forced, decision = judged(within.highlights(material, TRUE, NOISE), "on")
+    assert decision.state == "on" and forced.weight < 0.02
+
+
+def test_what_is_held_stays():
+    within, material = photographed()
+    shared = Globals.of(Light(120.0, 2.0, 2.0), Response(0.45), f0=0.05)
+    renewed = within.renewed(material, shared, ("n", "gamma"), NOISE)
+    assert (renewed.gamma, renewed.log_light[1]) == (pytest.approx(0.45), pytest.approx(2.0))
+    assert renewed.log_light[2] != pytest.approx(2.0, rel=1e-3)
+
+
+def test_without_a_specular_lobe_f0_stays():
+    within, material = photographed()
+    shared = replace(TRUE, specular=False)
+    assert within.renewed(material, shared, (), NOISE).vector[4] == TRUE.vector[4]
+
+
+def test_photos_of_one_distance_leave_the_falloff_near_its_prior():
+    within, material = photographed()
+    samples = replace(within.samples, log_distance=torch.full_like(within.samples.log_distance, np.log(20)))
+    shared = Globals.of(Light(120.0, 1.7, 2.0), Response(0.42), f0=0.035)
+    found = replace(within, samples=samples).renewed(material, shared, (), NOISE)
+    assert found.log_light[2] == pytest.approx(2.0, rel=0.1)
+    assert found.gamma == pytest.approx(0.42, rel=0.01)
+
+
+def test_photos_without_a_usable_pixel_change_nothing():
+    within, material = photographed()
+    white = replace(within.samples, color=torch.full_like(within.samples.color, 255))
+    assert replace(within, samples=white).renewed(material, TRUE, (), NOISE) is TRUE
