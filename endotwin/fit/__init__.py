@@ -58,7 +58,7 @@ def fit(
         return fit_twin(twin, Pace(config, progress), seed, effects or {}, price)
     if effects:
         raise OptionError(
-            "--effects belongs to --method twin; endopbr is Han & Wu's model as published, without effects"
+            "effects belong to the method twin; endopbr is Han & Wu's model as published, without effects"
         )
     from endotwin.fit.endopbr import fit_endopbr
 
