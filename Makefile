@@ -1,16 +1,17 @@
-# make demo: the whole job on the bundled example.   make test: the test suite.   Both make .venv first.
+# make demo: the whole job on the bundled example.   make test-fast, make test: the tests.   All make .venv first.
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
 BIN := .venv/bin
 TORCH := torch==2.13.0
 
 .DEFAULT_GOAL := help
-.PHONY: help venv demo test clean
+.PHONY: help venv demo test test-fast clean
 
 help:
-	@echo "make demo   fuse, fit, eval, synth and inspect the bundled example; results in demo/"
-	@echo "make test   run the test suite"
-	@echo "make venv   only make .venv with the pinned dependencies"
-	@echo "make clean  remove .venv and demo/"
+	@echo "make demo       fuse, fit, eval, synth and inspect the bundled example; results in demo/"
+	@echo "make test-fast  run the tests of a working day"
+	@echo "make test       run all tests"
+	@echo "make venv       only make .venv with the pinned dependencies"
+	@echo "make clean      remove .venv and demo/"
 
 venv: .venv/.installed
 
@@ -23,7 +24,10 @@ demo: venv
 	$(BIN)/python examples/demo.py
 
 test: venv
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -n auto --dist loadfile
+
+test-fast: venv
+	$(BIN)/python -m pytest -n auto --dist loadfile -m "not slow"
 
 clean:
 	rm -rf .venv demo

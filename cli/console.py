@@ -98,7 +98,9 @@ def _check_profile(path: Path) -> None:
     """Raise OutputError unless ``path`` is free, or an earlier profile to be replaced."""
     check_free(path, overwrite=True)
     try:
-        replaceable = not path.exists() or {"command", "seconds"} <= set(json.loads(path.read_text()))
+        replaceable = not path.exists() or {"command", "seconds"} <= set(
+            json.loads(path.read_text(encoding="utf-8"))
+        )
     except (OSError, ValueError, TypeError):
         replaceable = False
     if not replaceable:
@@ -121,5 +123,6 @@ def command(name: str, profile: Path | None = None) -> Iterator[Run]:
         logger.removeHandler(handler)
     if profile is not None:
         with whole_file(profile, overwrite=True) as file:
-            file.write_text(json.dumps({"command": name, **run.stopwatch.to_dict()}, indent=1) + "\n")
+            cost = {"command": name, **run.stopwatch.to_dict()}
+            file.write_text(json.dumps(cost, indent=1) + "\n", encoding="utf-8")
     print(f"{name}: {run.stopwatch}", file=sys.stderr)

@@ -21,6 +21,7 @@ def effects(
     """
     from dataclasses import asdict
 
+    from rich import box
     from rich.console import Console
     from rich.table import Table
 
@@ -35,7 +36,9 @@ def effects(
     if json:
         print(json_format.dumps({"effects": {name: asdict(value) for name, value in decisions.items()}}))
         return
-    table = Table("effect", "state", "why", "gain", "fit", "a frame", "memory")
+    table = Table(box=box.SIMPLE, pad_edge=False)
+    for heading in ("effect", "state", "why", "gain", "fit", "a frame", "memory"):
+        table.add_column(heading, no_wrap=heading != "why")
     for name, found in decisions.items():
         gain = "-" if found.gain_db is None else f"{found.gain_db:+.2f} dB"
         price = [f"{found.fit_s:.1f} s", f"{found.render_ms:.0f} ms", f"{found.memory_mb:.0f} MB"]

@@ -11,7 +11,7 @@ import typer
 from endotwin.cli import console
 
 from endotwin.errors import OutputError
-from endotwin.run.output import check_picture
+from endotwin.run.output import TWIN, check_free, check_picture
 
 if TYPE_CHECKING:
     from endotwin.twin import Twin
@@ -61,17 +61,22 @@ def evaluate(
             evaluation = evaluate(scored, sheet, run.progress, overwrite)
         print(json_format.dumps(evaluation.to_dict()) if json else evaluation)
         with run.stage("write"):
-            kept = _keep(twin.with_record(eval=evaluation.to_dict()), twin_folder)
+            kept = _keep(evaluation.to_dict(), twin, twin_folder)
     written = [f"the scores to {twin_folder}"] * kept + [f"the contact sheet to {sheet}"] * bool(sheet)
     if written and not json:
         print("wrote", " and ".join(written))
 
 
-def _keep(twin: Twin, folder: Path) -> bool:
-    """Save the twin with its scores, unless its folder lies where one may only read."""
+def _keep(scores: dict, twin: Twin, folder: Path) -> bool:
+    """Keep the scores in the twin's folder, unless another twin is there by now or one may only read it."""
     try:
-        twin.save(folder, overwrite=True)
+        check_free(folder, True, TWIN)
     except OutputError as error:
         logger.warning("The scores are not kept in the twin: %s", error)
         return False
+    current = type(twin).load(folder)
+    if current.seal != twin.seal:
+        logger.warning("The scores are not kept: %s was replaced while it was scored", folder)
+        return False
+    current.with_record(eval=scores).save(folder, overwrite=True)
     return True

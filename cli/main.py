@@ -12,8 +12,9 @@ from endotwin.cli.eval import evaluate
 from endotwin.cli.fit import fit
 from endotwin.cli.fuse import fuse
 from endotwin.cli.inspect import inspect
+from endotwin.cli.plain import spell_out
 from endotwin.cli.selfcheck import selfcheck
-from endotwin.cli.stop import Stopped, heed_signals
+from endotwin.cli.stop import Stopped, heed_signals, tell
 from endotwin.cli.synth import synth
 from endotwin.cli.tradeoff import tradeoff
 
@@ -72,6 +73,7 @@ def _usage(error: typer.BadParameter) -> str:
 def main() -> None:
     """Run the command line; exit code 2 and one line on stderr for every error that a user can mend."""
     heed_signals()
+    spell_out()
     try:
         sys.exit(app(sys.argv[1:] or ["--help"], standalone_mode=False))
     except USAGE_ERRORS as error:
@@ -87,8 +89,7 @@ def main() -> None:
         )
         sys.exit(2)
     except Stopped as stopped:
-        print("stopped;", *getattr(stopped, "__notes__", ["nothing was written"]), file=sys.stderr)
-        sys.exit(128 + stopped.args[0])
+        sys.exit(tell(stopped))
 
 
 if __name__ == "__main__":

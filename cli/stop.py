@@ -1,11 +1,21 @@
-"""Ctrl-C and SIGTERM: a command stops wherever it is, but not in the middle of an import."""
+"""Ctrl-C and SIGTERM: a command stops wherever it is, within seconds, with one line."""
 
 from __future__ import annotations
 
+import os
 import signal
+import sys
+import time
+from threading import Event, Thread
 from types import FrameType
 
 RETRY_S = 0.05
+PATIENCE_S = 1.2
+"""Time that a command has to tidy up after itself; what it leaves then, the next one sweeps."""
+
+SIGNALS = (signal.SIGINT, signal.SIGTERM)
+
+_told = Event()
 
 
 class Stopped(BaseException):
@@ -14,8 +24,32 @@ class Stopped(BaseException):
 
 def heed_signals() -> None:
     """From now on SIGINT and SIGTERM raise Stopped."""
-    for number in (signal.SIGINT, signal.SIGTERM):
+    for number in SIGNALS:
         signal.signal(number, _stop)
+
+
+def tell(stopped: Stopped) -> int:
+    """Say on stderr what was stopped; the exit code."""
+    _told.set()
+    print("stopped;", *getattr(stopped, "__notes__", ["nothing was written"]), file=sys.stderr)
+    return 128 + stopped.args[0]
+
+
+def lose_patience() -> None:
+    """From now on the process ends PATIENCE_S after SIGINT or SIGTERM, even within a long call of C code."""
+    listening, told = os.pipe()
+    os.set_blocking(told, False)
+    signal.set_wakeup_fd(told, warn_on_full_buffer=False)
+    Thread(target=_end_after, args=(listening,), daemon=True).start()
+
+
+def _end_after(listening: int) -> None:
+    while (number := os.read(listening, 1)[0]) not in SIGNALS:
+        pass
+    time.sleep(PATIENCE_S)
+    if not _told.is_set():
+        print("stopped", file=sys.stderr, flush=True)
+    os._exit(128 + number)
 
 
 def _stop(number: int, frame: FrameType | None) -> None:

@@ -4,7 +4,6 @@ The names below are imported when they are first used, so that ``import endotwin
 """
 
 import importlib
-import importlib.metadata
 import os
 
 # Threads that wait should sleep: spinning ones take the cores from the threads that they wait for, and a fit
@@ -31,7 +30,7 @@ __all__ = sorted(_HOME)
 
 def __getattr__(name: str):
     if name == "__version__":
-        return importlib.metadata.version("endotwin")
+        return importlib.import_module("importlib.metadata").version("endotwin")
     if name not in _HOME:
         raise AttributeError(f"module 'endotwin' has no attribute {name!r}")
     return getattr(importlib.import_module(f"endotwin.{_HOME[name]}"), name)

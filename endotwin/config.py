@@ -11,6 +11,7 @@ import yaml
 
 from endotwin.effects import NAMES, STATES
 from endotwin.errors import OptionError
+from endotwin.run.yamltext import parsed
 
 METHODS = ("twin", "endopbr")
 SUFFIXES = (".yaml", ".yml")
@@ -107,11 +108,11 @@ def load_config(name: str | Path) -> Config:
             f"there is no config '{text}'; name one of {', '.join(preset_names())}, or a file ending in .yaml"
         )
     try:
-        document = yaml.safe_load(path.read_text(encoding="utf-8"))
+        document = parsed(path.read_text(encoding="utf-8-sig"))
     except OSError as error:
         raise OptionError(f"{path} cannot be read ({error.strerror}); check its name") from error
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise OptionError(f"{path} is not YAML ({' '.join(str(error).split())}); mend that line") from error
+    except ValueError as error:
+        raise OptionError(f"{path} is not YAML ({error}); mend that line") from error
     return from_document(document, str(path))
 
 

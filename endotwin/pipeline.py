@@ -16,9 +16,11 @@ from endotwin.fit import fit
 from endotwin.render.price import priced
 from endotwin.run.stopwatch import Stopwatch
 from endotwin.sequence.readers import open_sequence
-from endotwin.twin import Source, Twin
+from endotwin.twin import Source, Twin, as_twin
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from endotwin.synth import Job, Limits, Summary
 
 GEOMETRIES = ("known", "heldout")
@@ -62,7 +64,7 @@ def fuse_twin(
         _check_positive("voxel size", voxel_mm)
     stopwatch = Stopwatch()
     with stopwatch.stage("open"):
-        sequence = open_sequence(Path(path), format=format, scale=scale)
+        sequence = open_sequence(path, format=format, scale=scale)
     source = Source(str(Path(path).resolve()), sequence.format, scale, geometry, frames=config.frames)
     training = source.training(len(sequence))
     if not training:
@@ -88,7 +90,7 @@ def fuse_twin(
 
 
 def fit_twin(
-    twin: Twin,
+    twin: Twin | Path | str,
     method: str | None = None,
     *,
     budget_s: float | None = None,
@@ -102,6 +104,7 @@ def fit_twin(
     """Fit materials, light and response to the training photos.
 
     Args:
+        twin: or its folder.
         method: ``twin``, or ``endopbr``: Han & Wu 2025 as published; the config's unless given.
         budget_s: give the best twin of so many seconds; the config's unless given.
         epochs: stop after so many passes over the training photos (``endopbr``).
@@ -117,21 +120,22 @@ def fit_twin(
     for name, value in (("budget", budget_s), ("number of epochs", epochs)):
         if value is not None:
             _check_positive(name, value)
+    twin = as_twin(twin)
     config = replace(config, method=method or config.method, budget=budget_s or config.budget)
     return fit(twin, config, epochs, seed, progress, checkpoint, effects, priced)
 
 
 def synthesize(
-    twin: Twin,
-    trajectory: str,
+    twin: Twin | Path | str,
+    trajectory: str | Path | np.ndarray,
     out: Path | str,
     *,
-    material: Iterable[str] = (),
-    light: Iterable[str] = (),
+    material: Iterable[str] | str = (),
+    light: Iterable[str] | str = (),
     vary: Path | str | None = None,
     camera: Path | str | None = None,
     effects: Mapping[str, str] | None = None,
-    labels: str | None = None,
+    labels: Iterable[str] | str | None = None,
     layout: str = "c3vd",
     limits: Limits | None = None,
     seed: int = 0,
@@ -143,10 +147,11 @@ def synthesize(
     """Render a labelled dataset from a fitted twin.
 
     Args:
+        twin: or its folder.
         trajectory: a pose file, ``jitter:…``, ``centerline:…``, ``spline:…`` or ``orbit:…`` (see
-            ``endotwin.synth.parse_trajectory``).
+            ``endotwin.synth.parse_trajectory``), or poses [N, 4, 4], camera to world in mm.
         out: the folder to make. A run that stops leaves ``OUT.partial``, and the same call goes on there.
-        material: edits such as ``roughness*1.3``. light: edits such as ``intensity*0.8``.
+        material: one edit such as ``roughness*1.3``, or several. light: such as ``intensity*0.8``.
         vary: YAML file of ranges that edits are drawn from (see ``endotwin.synth.read_variation``).
         camera: a ``camera.json`` to render through; the twin's own camera unless given.
         effects: on or off by name; noise and lens get the strength that is measured in the twin's sequence.
@@ -171,12 +176,12 @@ def synthesize(
 
 
 def preview(
-    twin: Twin,
-    trajectory: str,
+    twin: Twin | Path | str,
+    trajectory: str | Path | np.ndarray,
     out: Path | str,
     *,
-    material: Iterable[str] = (),
-    light: Iterable[str] = (),
+    material: Iterable[str] | str = (),
+    light: Iterable[str] | str = (),
     vary: Path | str | None = None,
     camera: Path | str | None = None,
     effects: Mapping[str, str] | None = None,
@@ -196,27 +201,31 @@ def preview(
 
 
 def _job(
-    twin: Twin,
-    trajectory: str,
-    material: Iterable[str],
-    light: Iterable[str],
+    twin: Twin | Path | str,
+    trajectory: str | Path | np.ndarray,
+    material: Iterable[str] | str,
+    light: Iterable[str] | str,
     vary: Path | str | None,
     camera: Path | str | None,
     effects: Mapping[str, str] | None,
-    labels: str | None,
+    labels: Iterable[str] | str | None,
     layout: str,
     limits: Limits | None,
     seed: int,
 ) -> Job:
     from endotwin import synth
 
+    twin = as_twin(twin)
     lens = read_camera(Path(camera)) if camera else twin.camera
     twin = synth.equipped(twin, effects or {}, trajectory)
+    material, light = ([edits] if isinstance(edits, str) else edits for edits in (material, light))
     edits = [synth.parse_material_edit(edit) for edit in material]
     variation = synth.fixed(edits, [synth.parse_light_edit(edit) for edit in light])
     if vary:
         variation = synth.read_variation(Path(vary), twin, variation)
-    chosen = synth.parse_labels(labels) if labels else synth.DEFAULT_LABELS
+    chosen = synth.DEFAULT_LABELS
+    if labels is not None:
+        chosen = synth.parse_labels(labels if isinstance(labels, str) else ",".join(labels))
     poses = synth.parse_trajectory(trajectory, twin, seed, lens, limits)
     return synth.make_job(twin, poses, seed, chosen, layout, lens, variation)
 

@@ -24,6 +24,8 @@ from endotwin.check.warp import disagreement
 from endotwin.errors import SequenceError
 from endotwin.sequence.readers import open_sequence
 
+pytestmark = pytest.mark.slow
+
 QUICK = [
     "poses transposed",
     "poses inverted",

@@ -6,6 +6,8 @@ import pytest
 from command_line import invoke
 from damaged import DAMAGES, Copy
 
+pytestmark = pytest.mark.slow
+
 
 def test_exit_code_0_and_a_table_where_all_agrees(example, capsys):
     assert invoke("check", example) == 0

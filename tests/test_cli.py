@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -207,17 +208,6 @@ def test_a_stopped_command_leaves_nothing_behind(endotwin, tube, tmp_path, monke
     assert sorted(tmp_path.rglob("*")) == before
 
 
-def test_a_full_disk_is_an_error_of_one_line_and_leaves_nothing_behind(fails, made, tmp_path, monkeypatch):
-    from endotwin.surface import Surface
-
-    def save(self: Surface, path: Path) -> None:
-        path.write_bytes(b"half")
-        raise OSError(errno.ENOSPC, "No space left on device", str(path))
-
-    monkeypatch.setattr(Surface, "save", save)
-    assert "No space left" in fails("fuse", made / "tube", "-o", tmp_path / "twin")
-
-
 # Bad input: the sequence
 
 
@@ -359,11 +349,8 @@ def test_overwrite_replaces_a_twin_and_keeps_what_is_not_the_twins(endotwin, mad
     (tmp_path / "twin" / "notes").touch()
     code, _, err = endotwin("fuse", made / "tube", "-o", tmp_path / "twin", "--overwrite")
     assert code == 0, err
-    assert sorted(entry.name for entry in (tmp_path / "twin").iterdir()) == [
-        "notes",
-        "surface.safetensors",
-        "twin.json",
-    ]
+    names = sorted(entry.name.split("-")[0] for entry in (tmp_path / "twin").iterdir())
+    assert names == ["notes", "surface", "twin.json"]
 
 
 @pytest.mark.parametrize(
@@ -423,7 +410,45 @@ def test_a_twin_is_scored_and_fitted_from_where_one_stands_and_keeps_its_guests(
     for command in (["eval", ".", "--sheet", "sheet.png"], ["fit", ".", "--overwrite", "--budget", 1]):
         code, _, err = endotwin(*command, "--profile", "profile.json")
         assert code == 0, err
-        assert {"sheet.png", "profile.json", "twin.json", "materials.safetensors"} <= set(os.listdir("."))
+        assert {"sheet.png", "profile.json", "twin.json"} < set(os.listdir("."))
+        assert len(list(Path(".").glob("materials-*"))) == 1
+
+
+def test_names_of_effects_are_whole_on_a_narrow_terminal(endotwin, made, monkeypatch):
+    from endotwin.effects import NAMES
+    from endotwin.twin import Twin
+
+    monkeypatch.setenv("COLUMNS", "80")
+    code, out, _ = endotwin("effects", made / "twin")
+    decided = Twin.load(made / "twin").decisions
+    assert code == 0 and len(decided) > 5
+    assert {line.split()[0] for line in out.splitlines() if line.split()} >= set(decided) & set(NAMES)
+    assert max(map(len, out.splitlines())) <= 80
+
+
+def test_no_label_is_no_choice_of_labels(fails, made, tmp_path):
+    trajectory = ["--trajectory", "jitter:frames=1"]
+    assert "no label ''" in fails(
+        "synth", made / "twin", *trajectory, "--labels", "", "-o", tmp_path / "dataset"
+    )
+
+
+def test_the_scores_of_a_twin_that_was_replaced_meanwhile_are_not_kept(endotwin, made, tmp_path, monkeypatch):
+    from endotwin import evaluation
+    from endotwin.twin import Twin
+
+    shutil.copytree(made / "twin", tmp_path / "twin")
+    evaluate = evaluation.evaluate
+
+    def overtaken(twin: Twin, *arguments):
+        replace(twin, light=replace(twin.light, n=1.5)).save(tmp_path / "twin", overwrite=True)
+        return evaluate(twin, *arguments)
+
+    monkeypatch.setattr(evaluation, "evaluate", overtaken)
+    code, out, err = endotwin("eval", tmp_path / "twin")
+    assert code == 0 and "mean" in out and "was replaced while it was scored" in err
+    kept = Twin.load(tmp_path / "twin")
+    assert kept.light.n == 1.5 and "eval" not in kept.record
 
 
 def test_the_scores_are_printed_even_if_they_cannot_be_kept(endotwin, made, tmp_path, monkeypatch):
@@ -458,7 +483,7 @@ def test_a_folder_that_is_no_twin(fails, made, command):
 
 def test_a_damaged_twin(fails, made, tmp_path):
     shutil.copytree(made / "twin", tmp_path / "twin")
-    surface = tmp_path / "twin" / "surface.safetensors"
+    (surface,) = (tmp_path / "twin").glob("surface-*")
     surface.write_bytes(surface.read_bytes()[:1000])
     assert "damaged" in fails("eval", tmp_path / "twin")
 

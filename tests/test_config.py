@@ -83,6 +83,7 @@ def test_what_a_file_leaves_out_is_as_in_standard(tmp_path):
         ("fuse: 3", ["fuse", "3"]),
         ("- fuse", ["keys with values"]),
         ("fuse: {scale: [", ["not YAML"]),
+        pytest.param("{a: " * 20_000, ["not YAML", "nested too deeply"], id="deep"),
     ],
 )
 def test_a_mistake_in_a_file_is_one_sentence_with_the_file_and_the_key(tmp_path, text, told):

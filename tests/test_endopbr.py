@@ -13,6 +13,8 @@ from endotwin.fit import endopbr
 from endotwin.surface import Surface
 from endotwin.twin import Source, Twin
 
+pytestmark = pytest.mark.slow
+
 PIXELS = 2048
 
 

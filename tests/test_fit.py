@@ -19,6 +19,8 @@ from endotwin.pixels.pace import Pace
 from endotwin.pixels.samples import gather
 from endotwin.surface.casting import Caster
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module", autouse=True)
 def one_thread():
@@ -190,9 +192,9 @@ def test_photos_that_show_nothing_of_the_surface_are_an_error(tube, tmp_path):
     "options, message",
     [
         ({"config": FitConfig(method="nerf")}, "unknown method 'nerf'.*twin, endopbr"),
-        ({"epochs": 3}, "--epochs belongs to --method endopbr"),
+        ({"epochs": 3}, "epochs belong to the method endopbr"),
         ({"effects": {"noise": "on"}}, "rendered and not fitted.*synth --effects noise=on"),
-        ({"config": FitConfig(method="endopbr"), "effects": {"gain": "on"}}, "belongs to --method twin"),
+        ({"config": FitConfig(method="endopbr"), "effects": {"gain": "on"}}, "belong to the method twin"),
     ],
 )
 def test_options_that_make_no_sense_are_refused(tube, options, message):

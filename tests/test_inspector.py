@@ -1,6 +1,7 @@
 """The inspector's pictures: all maps, from outside and inside, with and without the sequence."""
 
 import sys
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -97,7 +98,7 @@ def test_without_a_display_that_answers_the_window_says_what_to_do(twin, monkeyp
         monkeypatch.delenv(name, raising=False)
     if display:
         monkeypatch.setenv("DISPLAY", display)
-    with pytest.raises(OptionError, match="--screenshot"):
+    with pytest.raises(OptionError, match="a PNG file as screenshot"):
         inspector.inspect(twin)
 
 
@@ -107,11 +108,37 @@ def test_a_saved_keyframe_is_the_view_and_keyframes_add_up(twin, tmp_path):
     stage._plotter.camera_position = [pose[:3, 3], pose[:3, 3] + 5 * pose[:3, 2], -pose[:3, 1]]
     np.testing.assert_allclose(stage.view_pose(), pose, atol=1e-9)
     assert stage.save_keyframe(tmp_path / "keys.txt") == 1
-    stage.look_from_outside()
     assert stage.save_keyframe(tmp_path / "keys.txt") == 2
+    stage.look_from_outside()
+    with pytest.raises(TrajectoryError, match="not from within the lumen"):
+        stage.save_keyframe(tmp_path / "keys.txt")
     poses, _ = read_poses(tmp_path / "keys.txt")
-    np.testing.assert_allclose(poses[0], pose, atol=1e-9)
+    np.testing.assert_allclose(poses, [pose, pose], atol=1e-9)
+    stage.look_from_inside()
     (tmp_path / "other.txt").write_text("precious")
     with pytest.raises(TrajectoryError, match="other"):
         stage.save_keyframe(tmp_path / "other.txt")
     assert (tmp_path / "other.txt").read_text() == "precious"
+
+
+def test_a_slit_behind_a_rim_is_no_crack_from_inside(twin):
+    s, _ = tube_twin.to_axis(twin.surface.vertices_mm + twin.surface.origin_mm)
+    middle = s[twin.surface.triangles].mean(axis=1)
+    whole = np.abs(middle - 0.9) > 0.004
+    slit = replace(twin, surface=replace(twin.surface, triangles=twin.surface.triangles[whole]))
+    assert 100 < np.count_nonzero(~whole) < 600
+    pictures = []
+    for each in (twin, slit):
+        poses = np.stack([tube_twin.pose(0.5)] * 3)
+        stage = inspector.Stage(each, inspector.twin_maps(each), off_screen=True, poses=poses)
+        pictures.append(stage.contact_sheet(["base_color"])[-HEIGHT:].astype(float))
+    background = np.array([0x14, 0x16, 0x1A])
+    dark = [(np.abs(picture - background).max(axis=-1) < 12).sum() for picture in pictures]
+    assert dark[1] <= dark[0] + 5
+
+
+def test_a_window_fits_the_screen_that_it_is_shown_on():
+    assert inspector._fitting((1440, 1080), (3840, 2160)) == (1440, 1080)
+    for screen in ((1366, 768), (1024, 1366)):
+        width, height = inspector._fitting((1440, 1080), screen)
+        assert width < screen[0] and height < screen[1] and abs(width / height - 4 / 3) < 0.01

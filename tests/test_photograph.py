@@ -55,7 +55,7 @@ def test_motion_blurs_only_a_camera_that_moves(twin):
 
 
 def test_an_effect_that_only_a_fit_finds_is_not_switched_on(twin):
-    with pytest.raises(OptionError, match="endotwin fit"):
+    with pytest.raises(OptionError, match="a fit with its effect gain on"):
         equipped(twin, {"gain": "on"}, "centerline:frames=3")
 
 

@@ -11,6 +11,8 @@ import tube_sequence
 
 import endotwin
 
+pytestmark = pytest.mark.slow
+
 EXAMPLES = Path(__file__).parents[1] / "examples"
 
 

@@ -1,10 +1,13 @@
 """Readers, on files that plain NumPy, Pillow and tifffile wrote here, and on every kind of bad input."""
 
+import codecs
 import json
 import re
 import shutil
+import struct
 import subprocess
 import sys
+import zlib
 
 import cv2
 import numpy as np
@@ -16,6 +19,7 @@ from scipy.spatial.transform import Rotation
 
 from endotwin.cameras import CALIBRATIONS, Fisheye, Pinhole
 from endotwin.errors import CameraError, OptionError, SequenceError, TrajectoryError
+from endotwin.sequence.images import PNG_SIGNATURE
 from endotwin.sequence.poses import read_poses, write_c3vd_poses
 from endotwin.sequence.readers import FORMATS, open_sequence
 
@@ -486,8 +490,29 @@ def test_photos_are_not_enlarged(tmp_path):
 
 def test_depth_that_is_not_16_bit(tmp_path):
     folder = write_c3vd(tmp_path / "c3vd")
-    tifffile.imwrite(folder / "0000_depth.tiff", np.ones((H, W), np.float32))
+    tifffile.imwrite(folder / "0000_depth.tiff", np.ones((H, W), np.uint8))
     refused(folder, "0000_depth.tiff", "16 bit")
+
+
+def test_a_byte_order_mark_is_no_part_of_a_file(tmp_path):
+    folder = write_c3vd(tmp_path / "c3vd")
+    before = open_sequence(folder)
+    for name in ("pose.txt", "camera.json"):
+        (folder / name).write_bytes(codecs.BOM_UTF8 + (folder / name).read_bytes())
+    after = open_sequence(folder)
+    np.testing.assert_array_equal(after.T_world_camera, before.T_world_camera)
+    assert after.camera == before.camera
+
+
+def test_photos_that_are_marked_as_turned_are_read_as_stored_with_a_warning(tmp_path, caplog):
+    folder = write_c3vd(tmp_path / "c3vd")
+    stored = open_sequence(folder).color(0)
+    assert "turned" not in caplog.text
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    Image.fromarray(stored).save(folder / "0000_color.png", exif=exif)
+    np.testing.assert_array_equal(open_sequence(folder).color(0), stored)
+    assert "0000_color.png is marked as turned (EXIF orientation 6)" in caplog.text
 
 
 @pytest.mark.parametrize("kept", [0, 10, 0.5, 0.9, -20, -5, -1])
@@ -534,6 +559,30 @@ def test_a_tiff_that_lost_its_end_prints_nothing_but_the_error(tmp_path, compres
     )
     assert "0000_depth.tiff is truncated" in ran.stdout
     assert ran.stderr == ""
+
+
+def png_that_claims(size: int) -> bytes:
+    """A PNG file of a few bytes whose header says that it is ``size`` pixels wide and high."""
+
+    def chunk(kind: bytes, content: bytes) -> bytes:
+        body = kind + content
+        return struct.pack(">I", len(content)) + body + struct.pack(">I", zlib.crc32(body))
+
+    header = chunk(b"IHDR", struct.pack(">IIBBBBB", size, size, 8, 2, 0, 0, 0))
+    return PNG_SIGNATURE + header + chunk(b"IDAT", zlib.compress(b"0")) + chunk(b"IEND", b"")
+
+
+def test_a_photo_that_claims_to_be_huge_is_refused(tmp_path):
+    folder = write_c3vd(tmp_path / "c3vd")
+    (folder / "0000_color.png").write_bytes(png_that_claims(60_000))
+    with pytest.raises(SequenceError, match=r"0000_color\.png says that it is larger than any image"):
+        open_sequence(folder)
+
+
+@pytest.mark.parametrize("scale", (0.01, 0.1))
+def test_a_scale_that_leaves_too_few_pixels_is_refused(tmp_path, scale):
+    with pytest.raises(OptionError, match=r"A scale of .* leaves .* pixels|leaves nothing"):
+        open_sequence(write_c3vd(tmp_path / "c3vd"), scale=scale)
 
 
 def test_a_truncated_jpeg_is_refused(tmp_path):

@@ -146,6 +146,33 @@ def test_a_gap_of_one_or_two_pixels_is_no_black_line_and_a_wider_one_is(plane, g
     assert view.color[row, within].any(axis=-1).all() == closed
 
 
+def with_back_of_a_sliver(plane: Surface, width_px: float) -> Surface:
+    """The plane with a narrow strip before its middle that shows the camera its back."""
+    half = width_px / 2 / CAMERA.fx * (PLANE_MM - 1)
+    x, y = np.array([-half, half, half, -half]), np.array([-3.0, -3, 3, 3])
+    strip = np.stack([x, y, np.full(4, PLANE_MM - 1)], axis=1) + CENTRE_MM - plane.origin_mm
+    count = len(plane.vertices_mm)
+    return Surface.from_mesh(
+        np.concatenate([plane.vertices_mm, strip]) + plane.origin_mm,
+        np.concatenate([plane.triangles, count + np.array([[0, 2, 1], [0, 3, 2]])]),
+        np.concatenate([plane.normals, np.tile([[0, 0, 1.0]], (4, 1))]),
+    )
+
+
+@pytest.mark.parametrize("width_px", (0.5, 1.5))
+def test_the_back_of_a_sliver_is_no_black_dot(plane, width_px):
+    before = Renderer(twin_of(plane)).view(look(CENTRE_MM, [0, 0, 1]))
+    view = Renderer(twin_of(with_back_of_a_sliver(plane, width_px))).view(look(CENTRE_MM, [0, 0, 1]))
+    assert (view.depth_mm < PLANE_MM - 0.5).sum() > 10 or width_px < 1
+    np.testing.assert_allclose(view.color, before.color, atol=0.02)
+
+
+def test_a_wall_that_is_seen_from_behind_all_over_stays_dark(plane):
+    turned = Surface.from_mesh(plane.vertices_mm + plane.origin_mm, plane.triangles, -plane.normals)
+    view = Renderer(twin_of(turned)).view(look(CENTRE_MM, [0, 0, 1]))
+    assert view.mask.any() and view.color.max() < 0.05
+
+
 def test_a_mask_limits_the_view_and_changes_nothing_within(sphere):
     renderer = Renderer(twin_of(sphere))
     whole = renderer.view(at_centre())

@@ -1,6 +1,7 @@
 """A run that stops, is killed or fills the disk goes on, and the finished bytes do not tell."""
 
 import errno
+import gc
 import os
 import subprocess
 import sys
@@ -13,10 +14,14 @@ import pytest
 import tube_twin
 
 from endotwin.errors import OptionError, OutputError
-from endotwin.synth import Trajectory, synthesize
+from endotwin.synth import Trajectory, Variation, make_job, synthesize
+from endotwin.synth.labels import Labeller
 from endotwin.synth.run import crew
 from endotwin.synth.run.partial import Partial, partial_path
+from endotwin.synth.run.shard import render_shard
 from endotwin.twin import Twin
+
+pytestmark = pytest.mark.slow
 
 FRAMES = 56
 LABELS = ("rgb", "depth", "mask", "flow")
@@ -57,9 +62,12 @@ print(kills)
 
 def render(twin: Twin, out: Path | str, **options) -> None:
     """A small dataset of the twin."""
+    synthesize(twin, trajectory(), out, labels=LABELS, **options)
+
+
+def trajectory() -> Trajectory:
     poses = np.stack([tube_twin.pose(s) for s in np.linspace(0.1, 0.9, FRAMES)])
-    trajectory = Trajectory(poses, np.arange(FRAMES) / 30, "along the axis")
-    synthesize(twin, trajectory, out, labels=LABELS, **options)
+    return Trajectory(poses, np.arange(FRAMES) / 30, "along the axis")
 
 
 def contents(folder: Path) -> dict[str, bytes]:
@@ -127,6 +135,33 @@ def test_a_dask_cluster_of_two_workers_gives_the_same_bytes(twin, whole, tmp_pat
     assert contents(tmp_path / "dataset") == whole
 
 
+def test_a_cluster_that_is_lost_is_told_and_the_run_goes_on_with_another(twin, whole, tmp_path):
+    distributed = pytest.importorskip("distributed")
+    options = {"threads_per_worker": 1, "dashboard_address": None, "processes": False}
+    with distributed.LocalCluster(1, **options) as cluster:
+        lost = {"scheduler": cluster.scheduler_address, "progress": lambda *_: cluster.close()}
+        with pytest.raises(OutputError, match=r"scheduler .* lost.*the same command goes on"):
+            render(twin, tmp_path / "dataset", **lost)
+    render(twin, tmp_path / "dataset")
+    assert contents(tmp_path / "dataset") == whole
+
+
+def test_a_worker_that_lives_on_makes_no_folder_that_its_run_has_removed(twin, tmp_path):
+    job = make_job(twin, trajectory(), 0, LABELS, "c3vd2", twin.camera, Variation())
+    with pytest.raises(FileNotFoundError):
+        render_shard(job, Labeller(job), tmp_path / "dataset.partial", 0)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("address", ["foo", "tcp://", "nowhere.invalid:8786"])
+def test_an_address_that_makes_no_sense_is_told_in_one_sentence(twin, tmp_path, capfd, address):
+    pytest.importorskip("distributed")
+    with pytest.raises(OptionError, match="no Dask scheduler answers"):
+        render(twin, tmp_path / "dataset", scheduler=address)
+    gc.collect()
+    assert capfd.readouterr().err == "" and list(tmp_path.iterdir()) == []
+
+
 def test_a_scheduler_that_does_not_answer_is_named_and_nothing_is_left(twin, tmp_path, monkeypatch):
     pytest.importorskip("distributed")
     monkeypatch.setattr(crew, "SCHEDULER_TIMEOUT_S", 0.2)
@@ -192,6 +227,28 @@ def test_another_command_does_not_go_on_with_an_unfinished_dataset(twin, whole, 
         render(twin, tmp_path / "dataset", seed=1)
     render(twin, tmp_path / "dataset", overwrite=True)
     assert contents(tmp_path / "dataset") == whole
+
+
+def test_a_dataset_that_is_replaced_keeps_what_others_put_into_it(twin, whole, tmp_path):
+    out = tmp_path / "dataset"
+    render(twin, out, seed=1)
+    (out / "0000_extra.tiff").write_bytes(b"endotwin's no more")
+    (out / "splits").mkdir()
+    (out / "splits" / "0001_color.png").write_bytes(b"mine")
+    (out / "0001_depth.tiff").write_bytes(b"broken")
+
+    class Stopped(BaseException):
+        pass
+
+    def stopped(*_) -> None:
+        raise Stopped
+
+    with pytest.MonkeyPatch.context() as patch, pytest.raises(Stopped):
+        patch.setattr(Partial, "remove", stopped)
+        render(twin, out, overwrite=True)
+    render(twin, out, overwrite=True)
+    guests = {"0000_extra.tiff": b"endotwin's no more", "splits/0001_color.png": b"mine"}
+    assert contents(out) == {**whole, **guests}
 
 
 def test_a_folder_of_someone_else_is_not_taken_for_an_unfinished_dataset(twin, tmp_path):

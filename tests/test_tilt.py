@@ -16,6 +16,8 @@ from endotwin.fit.gauss_newton import GaussNewton
 from endotwin.fit.tilt import tilted
 from endotwin.surface.vectors import unit
 
+pytestmark = pytest.mark.slow
+
 DISTURBED_DEG = 1.0
 
 

@@ -25,6 +25,8 @@ from endotwin.tradeoff.knee import knee, pareto_front
 from endotwin.tradeoff.measure import stages
 from endotwin.twin import Source
 
+pytestmark = pytest.mark.slow
+
 points = st.integers(1, 30).flatmap(
     lambda count: st.tuples(
         arrays.arrays(float, count, elements=st.floats(0.1, 1000)),

@@ -18,6 +18,8 @@ from endotwin.synth.trajectories.centerline import find_centerline
 from endotwin.synth.trajectories.lumen import Lumen
 from endotwin.synth.trajectories.screening import Gate, Limits
 
+pytestmark = pytest.mark.slow
+
 AXIS_MM = tube_twin.BEND_MM * tube_twin.SWEEP
 
 

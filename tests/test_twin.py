@@ -6,9 +6,11 @@ from dataclasses import asdict, replace
 import numpy as np
 import pytest
 import tube_twin
+from faults import full_disk, killed_at_every_operation
+from safetensors.numpy import save_file
 from scenes import omni
 
-from endotwin.effects import Effects
+from endotwin.effects import Decision, Effects
 from endotwin.effects.gain import Gain
 from endotwin.effects.offset import Offset
 from endotwin.effects.shadows import Shadows
@@ -53,7 +55,7 @@ def test_an_unfitted_twin_loads_unfitted_over_a_fitted_one(twin, tmp_path):
     loaded = Twin.load(tmp_path / "twin")
     assert_same(unfitted, loaded)
     assert not loaded.fitted and "not fitted" in repr(loaded)
-    assert not (tmp_path / "twin" / "materials.safetensors").exists()
+    assert not list((tmp_path / "twin").glob("materials*"))
 
 
 def test_a_twin_that_exists_is_refused_untouched(twin, tmp_path):
@@ -115,11 +117,117 @@ def test_an_unreadable_document_names_its_file(twin, tmp_path, text):
         Twin.load(tmp_path / "twin")
 
 
-@pytest.mark.parametrize("name", ("surface.safetensors", "materials.safetensors"))
+def test_scores_replace_one_small_file_and_a_fit_leaves_the_surface(twin, tmp_path):
+    tube_twin.unfitted(twin).save(tmp_path / "twin")
+    (surface,) = files = list((tmp_path / "twin").glob("surface-*"))
+    written = surface.stat().st_ino
+    twin.save(tmp_path / "twin", overwrite=True)
+    files = {file.name: file.stat().st_ino for file in (tmp_path / "twin").iterdir()}
+    assert files[surface.name] == written and len(files) == 3
+    twin.with_record(eval={"psnr": 38.5}).save(tmp_path / "twin", overwrite=True)
+    after = {file.name: file.stat().st_ino for file in (tmp_path / "twin").iterdir()}
+    assert files.keys() == after.keys()
+    assert {name for name in files if files[name] != after[name]} == {"twin.json"}
+    assert (tmp_path / "twin" / "twin.json").stat().st_size < 10_000
+
+
+def write_version_1(twin: Twin, folder) -> None:
+    """The twin as version 1 had it: arrays under fixed names, decisions in a file of their own."""
+    folder.mkdir()
+    (folder / "surface.safetensors").write_bytes(twin.surface.to_bytes())
+    save_file(twin.materials.per_vertex, folder / "materials.safetensors")
+    decisions = {name: asdict(decision) for name, decision in twin.decisions.items()}
+    (folder / "effects.json").write_text(json.dumps({"effects": decisions}))
+    document = {
+        "version": 1,
+        "camera": twin.camera.to_dict(),
+        "source": asdict(twin.source),
+        "materials": {"f0": twin.materials.f0, "diffuse": twin.materials.diffuse},
+        "light": asdict(twin.light),
+        "response": asdict(twin.response),
+        "effects": twin.effects.to_dict(),
+        "record": twin.record,
+    }
+    (folder / "twin.json").write_text(json.dumps(document))
+
+
+def test_a_twin_of_version_1_loads_and_the_next_that_is_saved_there_takes_its_place(twin, tmp_path):
+    twin = replace(twin, decisions={"gain": Decision("off", "the gain is kept")})
+    write_version_1(twin, tmp_path / "twin")
+    loaded = Twin.load(tmp_path / "twin")
+    assert_same(twin, loaded)
+    assert loaded.decisions == twin.decisions
+    loaded.save(tmp_path / "twin", overwrite=True)
+    assert_same(twin, Twin.load(tmp_path / "twin"))
+    assert Twin.load(tmp_path / "twin").decisions == twin.decisions
+    names = {file.name.split("-")[0] for file in (tmp_path / "twin").iterdir()}
+    assert names == {"twin.json", "surface", "materials"}
+
+
+def fitted_again(twin: Twin) -> Twin:
+    """The twin with other materials and another light."""
+    materials = replace(twin.materials, roughness=1 - twin.materials.roughness)
+    return replace(twin, materials=materials, light=replace(twin.light, L0=9.0))
+
+
+@pytest.mark.parametrize("before", [lambda twin, path: twin.save(path), write_version_1])
+@pytest.mark.parametrize("change", [fitted_again, lambda twin: twin.with_record(eval={"psnr": 38.5})])
+def test_a_twin_is_old_or_new_wherever_its_replacement_is_killed(tmp_path, before, change):
+    old = tube_twin.fitted(tube_twin.surface())
+    new, path, found = change(old), tmp_path / "twin", []
+    before(old, path)
+
+    def look() -> None:
+        loaded = Twin.load(path)
+        found.append((loaded.light, loaded.record) != (old.light, old.record))
+        assert_same(new if found[-1] else loaded, loaded)
+        assert_same(loaded if found[-1] else old, loaded)
+        old.save(path, overwrite=True)
+        assert len(list(path.iterdir())) == 3 and list(tmp_path.iterdir()) == [path]
+
+    assert killed_at_every_operation(lambda: new.save(path, overwrite=True), look) >= 5
+    assert found == sorted(found) and set(found) == {False, True}
+
+
+def test_a_full_disk_leaves_the_twin_as_it_was(twin, tmp_path):
+    twin.save(tmp_path / "twin")
+    before = {file: file.read_bytes() for file in tmp_path.rglob("*") if file.is_file()}
+    for after in range(5):
+        told = pytest.raises(OutputError, match="twin cannot be written: the disk is full")
+        with told, full_disk(tmp_path, after):
+            fitted_again(twin).save(tmp_path / "twin", overwrite=True)
+        assert {file: file.read_bytes() for file in tmp_path.rglob("*") if file.is_file()} == before
+
+
+@pytest.mark.parametrize("name", ("surface", "materials"))
+@pytest.mark.parametrize("place", (0.1, 0.5, 0.9))
+def test_a_flipped_bit_in_an_array_file_is_told(twin, tmp_path, name, place):
+    twin.save(tmp_path / "twin")
+    (file,) = (tmp_path / "twin").glob(f"{name}-*")
+    content = bytearray(file.read_bytes())
+    content[int(place * len(content))] ^= 4
+    file.write_bytes(content)
+    with pytest.raises(TwinError, match=f"damaged twin \\({file.name} does not match its checksum\\)"):
+        Twin.load(tmp_path / "twin")
+
+
+def test_a_changed_number_in_the_document_is_told_and_the_sequence_may_move(twin, tmp_path):
+    twin.save(tmp_path / "twin")
+    file = tmp_path / "twin" / "twin.json"
+    document = json.loads(file.read_text())
+    file.write_text(json.dumps({**document, "source": {**document["source"], "path": "/elsewhere"}}))
+    assert Twin.load(tmp_path / "twin").source.path == "/elsewhere"
+    document["light"]["L0"] += 1e-9
+    file.write_text(json.dumps(document))
+    with pytest.raises(TwinError, match=r"damaged twin \(twin.json does not match its checksum\)"):
+        Twin.load(tmp_path / "twin")
+
+
+@pytest.mark.parametrize("name", ("surface", "materials"))
 @pytest.mark.parametrize("kept", (None, 0, 100))
 def test_a_missing_or_truncated_array_file_is_a_damaged_twin(twin, tmp_path, name, kept):
     twin.save(tmp_path / "twin")
-    file = tmp_path / "twin" / name
+    (file,) = (tmp_path / "twin").glob(f"{name}-*")
     data = file.read_bytes()
     file.unlink()
     if kept is not None:
@@ -155,3 +263,19 @@ def test_a_single_frame_is_fitted():
 def test_the_source_survives_a_round_trip_through_a_dictionary():
     source = Source("sequence", "tum", 0.5, "heldout", 4)
     assert Source(**json.loads(json.dumps(asdict(source)))) == source
+
+
+@pytest.mark.parametrize(
+    ("spoil", "says"),
+    [
+        (lambda surface: replace(surface, triangles=surface.triangles[:0]), "its surface is empty"),
+        (
+            lambda surface: replace(surface, vertices_mm=surface.vertices_mm * np.float32(1e30)),
+            r"its surface is .*e\+31 mm large",
+        ),
+    ],
+)
+def test_a_mesh_that_is_none_is_told_and_not_blamed_on_the_sequence(twin, tmp_path, spoil, says):
+    replace(twin, surface=spoil(twin.surface)).save(tmp_path / "twin")
+    with pytest.raises(TwinError, match=says):
+        Twin.load(tmp_path / "twin")

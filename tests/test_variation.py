@@ -206,6 +206,9 @@ def test_varied_frames_do_not_depend_on_where_a_run_stopped(ranges, twin, tmp_pa
         ("regions: [{name: a, vertices: nowhere.npy}]", "nowhere"),
         ("regions: 3", "no list"),
         ("material: [", "YAML"),
+        pytest.param("[" * 20_000, "nested too deeply", id="deep"),
+        ("regions: [{name: p, vertices: paint.txt}]", "is no vertex mask"),
+        ("regions: [{name: p, vertices: paint.ply}]", "is no vertex mask"),
         ("[1, 2]", "no keys"),
     ],
 )

@@ -100,7 +100,7 @@ def camera_from_dict(description: dict, where: Path) -> Camera:
 def read_camera(path: Path) -> Camera:
     """The camera in a ``camera.json``; raises CameraError where it is no camera."""
     try:
-        description = parsed(Path(path).read_text(encoding="utf-8"))
+        description = parsed(Path(path).read_text(encoding="utf-8-sig"))
     except (OSError, ValueError) as error:
         raise CameraError(
             f"{path} cannot be read as JSON ({error}); write it as {_example(Pinhole)}"

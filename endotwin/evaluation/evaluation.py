@@ -29,11 +29,12 @@ from endotwin.errors import TwinError
 from endotwin.evaluation import metrics
 from endotwin.light import shading
 from endotwin.render import Renderer
-from endotwin.run.output import check_picture, whole_file
+from endotwin.run.output import check_picture
 from endotwin.sequence import Frame
+from endotwin.sequence.images import write_png
 from endotwin.surface import Surface
 from endotwin.surface.casting import Correspondences
-from endotwin.twin import Light, Twin
+from endotwin.twin import Light, Twin, as_twin
 
 logger = logging.getLogger("endotwin")
 
@@ -166,7 +167,7 @@ def covered_pixels(hits: Correspondences, surface: Surface, shape: tuple[int, in
 
 
 def gain_of(photo: np.ndarray, radiance: np.ndarray, gamma: float) -> float:
-    """Factor on ``radiance`` [H, W, 3] that makes it look like ``photo`` (display-encoded, of its shape).
+    """Factor on ``radiance`` [..., 3] that makes it look like ``photo`` (display-encoded, of its shape).
 
     The median of their ratio over mid-tones, which highlights and shadows' edges do not move; 1 where there
     are none.
@@ -207,10 +208,10 @@ def _held_out(twin: Twin, progress: Progress | None) -> Iterator[_HeldOut]:
             logger.warning("Held-out frame %s has no valid pixel and is not scored.", frame.name)
             continue
         photo = frame.color.astype(np.float32) / 255
-        view, gain = renderer.view(frame.T_world_camera, valid), 1.0
+        view, gain = renderer.view(frame.T_world_camera, sequence.lens_mask), 1.0
         if "gain" in twin.effects:
-            gain = gain_of(photo, view.radiance, twin.response.gamma)
-            view = renderer.view(frame.T_world_camera, valid, gain)
+            gain = gain_of(photo[valid], view.radiance[valid], twin.response.gamma)
+            view = renderer.view(frame.T_world_camera, sequence.lens_mask, gain)
         covered = covered_pixels(view.hits, twin.surface, valid.shape)
         yield _HeldOut(frame, photo, view.color, gain, valid, covered)
     if progress:
@@ -238,11 +239,15 @@ def _score(held_out: _HeldOut) -> FrameScore:
 
 
 def evaluate(
-    twin: Twin, sheet: Path | None = None, progress: Progress | None = None, overwrite: bool = False
+    twin: Twin | Path | str,
+    sheet: Path | None = None,
+    progress: Progress | None = None,
+    overwrite: bool = False,
 ) -> Evaluation:
     """Score a fitted twin on the frames that were held out of its fit.
 
     Args:
+        twin: or its folder.
         sheet: PNG file to write a contact sheet to, one row photo | render | error a frame.
         progress: called with (label, done, total).
         overwrite: whether ``sheet`` may exist.
@@ -252,6 +257,7 @@ def evaluate(
         SequenceError: the twin's sequence has moved.
         OutputError: ``sheet`` exists or cannot be written.
     """
+    twin = as_twin(twin)
     if sheet is not None:
         check_picture(sheet, overwrite)
     scores, rows = [], []
@@ -264,7 +270,7 @@ def evaluate(
             f"{twin.source.path} has no held-out frame to score; fuse a sequence of two or more frames"
         )
     if sheet is not None:
-        _write_sheet(rows, sheet, overwrite)
+        write_png(Path(sheet), np.vstack(rows), overwrite)
     evaluation = Evaluation(tuple(scores), twin.response.gamma, twin.light, twin.source.geometry)
     if evaluation.psnr < POOR_DB:
         logger.warning(
@@ -275,12 +281,13 @@ def evaluate(
 
 
 def _sheet_row(held_out: _HeldOut, score: FrameScore) -> np.ndarray:
-    """Photo, render and error side by side, uint8 [h, 3·SHEET_WIDTH, 3], BGR."""
+    """Photo, render and error side by side, uint8 [h, 3·SHEET_WIDTH, 3], RGB."""
     error = np.abs(held_out.photo - held_out.render).mean(axis=-1) / ERROR_FULL_SCALE * held_out.valid
+    heat = cv2.applyColorMap(_eight_bit(error), cv2.COLORMAP_INFERNO)
     pictures = {
-        f"photo {held_out.frame.name}": cv2.cvtColor(held_out.frame.color, cv2.COLOR_RGB2BGR),
-        f"render, {score.psnr:.1f} dB": cv2.cvtColor(_eight_bit(held_out.render), cv2.COLOR_RGB2BGR),
-        f"error, 0 to {ERROR_FULL_SCALE:g}": cv2.applyColorMap(_eight_bit(error), cv2.COLORMAP_INFERNO),
+        f"photo {held_out.frame.name}": held_out.frame.color,
+        f"render, {score.psnr:.1f} dB": _eight_bit(held_out.render),
+        f"error, 0 to {ERROR_FULL_SCALE:g}": cv2.cvtColor(heat, cv2.COLOR_BGR2RGB),
     }
     return np.hstack([_labelled(picture, label) for label, picture in pictures.items()])
 
@@ -296,8 +303,3 @@ def _labelled(picture: np.ndarray, label: str) -> np.ndarray:
         corner = (6 + offset, height - 8 + offset)
         cv2.putText(small, label, corner, cv2.FONT_HERSHEY_SIMPLEX, 0.42, color, 1, cv2.LINE_AA)
     return small
-
-
-def _write_sheet(rows: list[np.ndarray], path: Path, overwrite: bool) -> None:
-    with whole_file(path, overwrite) as file:
-        file.write_bytes(cv2.imencode(".png", np.vstack(rows))[1].tobytes())

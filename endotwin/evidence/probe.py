@@ -143,8 +143,10 @@ class Fitted:
     @property
     def possible(self) -> bool:
         """Whether γ, n and q are such as an endoscope may have."""
-        told = (self.gamma, self.n, self.q)
-        return all(low < value < high for value, (low, high) in zip(told, POSSIBLE, strict=True))
+        (least, most), *bounds = POSSIBLE
+        if not least < self.gamma < most:  # it is 0 where all photos are white, and n and q are 0/0
+            return False
+        return all(low < value < high for value, (low, high) in zip((self.n, self.q), bounds, strict=True))
 
 
 class Probe:

@@ -51,14 +51,14 @@ def fit(
     if config.method == "twin":
         if epochs is not None:
             raise OptionError(
-                "--epochs belongs to --method endopbr; bound the method twin with --budget SECONDS"
+                "epochs belong to the method endopbr; bound the method twin by a budget of seconds"
             )
         from endotwin.fit.solve import fit_twin
 
         return fit_twin(twin, Pace(config, progress), seed, effects or {}, price)
     if effects:
         raise OptionError(
-            "--effects belongs to --method twin; endopbr is Han & Wu's model as published, without effects"
+            "effects belong to the method twin; endopbr is Han & Wu's model as published, without effects"
         )
     from endotwin.fit.endopbr import fit_endopbr
 

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import torch
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
+from safetensors.torch import save
 
 from endotwin.run.output import whole_file
 from endotwin.twin import Twin
@@ -63,7 +63,7 @@ class Checkpoint:
             )
         about = {"identity": self._identity, "step": str(step), "seconds": repr(seconds)}
         with whole_file(self._path, overwrite=True) as file:
-            save_file(tensors, file, about)
+            file.write_bytes(save(tensors, about))
         self._written = time.perf_counter()
 
     @contextmanager

@@ -111,7 +111,10 @@ def _integrate(
     intrinsic = o3c.Tensor(face.intrinsics + HALF_PIXEL)
     image = o3d.t.geometry.Image(o3c.Tensor(depth_mm))
     reach = (1.0, float(depth_mm.max()) + 1.0, truncation_voxels)
-    blocks = grid.compute_unique_block_coordinates(image, intrinsic, extrinsic, *reach)
+    try:
+        blocks = grid.compute_unique_block_coordinates(image, intrinsic, extrinsic, *reach)
+    except RuntimeError:  # Open3D where the few pixels with depth touch none
+        return
     grid.integrate(blocks, image, intrinsic, extrinsic, *reach)
 
 

@@ -3,28 +3,34 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pyvista as pv
 from vtkmodules.vtkCommonCore import vtkLogger
 
 from endotwin.cameras import Camera
-from endotwin.errors import EndotwinError, OptionError, OutputError, SequenceError, TrajectoryError
+from endotwin.errors import EndotwinError, OptionError, SequenceError, TrajectoryError
 from endotwin.run.output import check_picture, whole_file
+from endotwin.sequence.images import write_png
 from endotwin.sequence.poses import read_poses, write_c3vd_poses
 from endotwin.synth.trajectories.flight import FlightOptions, fly
 from endotwin.synth.trajectories.lumen import Lumen
-from endotwin.twin import Twin
+from endotwin.twin import Twin, as_twin
 
 TILE = (720, 540)
-"""Size in pixels, width and height, of one view in a contact sheet; a window is twice as large."""
+"""Size in pixels, width and height, of one view in a contact sheet; a window is twice as large, if it can."""
+
+SCREEN = 0.85
+"""Share of the screen that a window takes at most: the rest is for its frame and for panels."""
 
 OFF_SCREEN_WINDOWS = ("vtkEGLRenderWindow", "vtkOSOpenGLRenderWindow")
 
 KEYS = "m, space: next map   o: outside   i: inside   c: camera path   k: save keyframe   q: quit"
 FRUSTA = 8
+SEAM = 1 / 120
+"""Width of the mesh's edges, as seen from inside, in widths of the picture: two pixels of a photo of 240."""
 LEAP = 10.0
 """Where a step between poses is this many times the usual one, they are drawn as points and not as a path."""
 
@@ -74,7 +80,7 @@ def twin_maps(twin: Twin) -> dict[str, Map]:
 
 
 def inspect(
-    twin: Twin,
+    twin: Twin | Path | str,
     screenshot: Path | str | None = None,
     map: str | None = None,
     overwrite: bool = False,
@@ -83,6 +89,7 @@ def inspect(
     """Open a window on ``twin``, or write a contact sheet of its maps without a display.
 
     Args:
+        twin: or its folder.
         screenshot: PNG file to write instead of opening a window.
         map: ``base_color``, ``roughness``, ``metallic``, ``coverage`` or ``normals``: the window's first, the
             sheet's only one. All maps unless given.
@@ -93,31 +100,37 @@ def inspect(
         OptionError: the twin has no such map, or there is no display to open a window on.
         OutputError: ``screenshot`` exists or cannot be written.
     """
+    twin = as_twin(twin)
     maps = twin_maps(twin)
     if map is not None and map not in maps:
         reason = "" if twin.fitted else " (it is not fitted yet)"
         raise OptionError(f"the twin has no map {map!r}{reason}; choose one of {', '.join(maps)}")
     if screenshot is None:
-        if not _has_display():
-            raise OptionError(
-                "there is no display to open a window on; write a picture with --screenshot FILE.png"
-            )
-        Stage(twin, maps, off_screen=False).open_window(map or next(iter(maps)), Path(keyframes))
+        screen = _screen()
+        if screen is None:
+            raise OptionError("there is no display to open a window on; name a PNG file as screenshot")
+        stage = Stage(twin, maps, off_screen=False, tile=_fitting((2 * TILE[0], 2 * TILE[1]), screen))
+        stage.open_window(map or next(iter(maps)), Path(keyframes))
         return
     check_picture(Path(screenshot), overwrite)
     sheet = Stage(twin, maps, off_screen=True).contact_sheet([map] if map else list(maps))
-    with whole_file(Path(screenshot), overwrite) as beside:
-        if not cv2.imwrite(str(beside), sheet[..., ::-1]):
-            raise OutputError(f"{screenshot} cannot be written; is the disk full?")
+    write_png(Path(screenshot), sheet, overwrite)
 
 
-def _has_display() -> bool:
-    """Whether VTK can open a window; where no display answers, its windows are off-screen ones."""
+def _screen() -> tuple[int, int] | None:
+    """Width and height of the screen, px; None where no display answers, and VTK has no windows to show."""
     vtkLogger.SetStderrVerbosity(vtkLogger.VERBOSITY_ERROR)
     plotter = pv.Plotter(off_screen=False)
-    kind = plotter.render_window.GetClassName()
+    window = plotter.render_window
+    screen = None if window.GetClassName() in OFF_SCREEN_WINDOWS else tuple(window.GetScreenSize())
     plotter.close()
-    return kind not in OFF_SCREEN_WINDOWS
+    return screen
+
+
+def _fitting(size: tuple[int, int], screen: tuple[int, int]) -> tuple[int, int]:
+    """``size``, or the largest of its shape that the screen has room for: what it says is at its edges."""
+    shrink = min(1.0, *(SCREEN * room / wanted for room, wanted in zip(screen, size, strict=True) if room))
+    return round(shrink * size[0]), round(shrink * size[1])
 
 
 def _rgb(values: np.ndarray) -> np.ndarray:
@@ -134,11 +147,13 @@ def _limits(values: np.ndarray) -> tuple[float, float]:
 class Stage:
     """One plotter with the mesh, the camera path and the labels.
 
-    The wall that turns its back is not drawn: from outside one looks into the tube, as into a doll's house.
+    From outside, the wall that turns its back is not drawn: one looks into the tube, as into a doll's house.
+    From inside it is, and the mesh's edges are drawn wide: no photo saw behind the rims of folds, which else
+    would be lined with cracks.
 
     Args:
         poses: [N, 4, 4] to draw; those of the twin's sequence unless given. frusta: how many of them to draw.
-        tile: size of a picture without a window, width and height.
+        tile: size of the picture or the window, width and height.
     """
 
     def __init__(
@@ -152,11 +167,11 @@ class Stage:
     ):
         if off_screen:  # VTK warns of the display that is not needed
             vtkLogger.SetStderrVerbosity(vtkLogger.VERBOSITY_ERROR)
-        self._maps, self._camera = maps, twin.camera
+        self._maps, self._camera, self._surface = maps, twin.camera, twin.surface
+        self._within = False
         self._poses, self._note = _recorded_poses(twin) if poses is None else (poses, "")
         self._frusta, self._inside = frusta, _viewpoint(twin, self._poses)
-        size = tile or TILE if off_screen else (2 * TILE[0], 2 * TILE[1])
-        self._plotter = pv.Plotter(off_screen=off_screen, window_size=list(size))
+        self._plotter = pv.Plotter(off_screen=off_screen, window_size=list(tile or TILE))
         self._plotter.set_background(BACKGROUND)
         self._plotter.enable_anti_aliasing("ssaa")
         surface = twin.surface
@@ -174,9 +189,15 @@ class Stage:
         self._mesh.point_data[name] = shown.values
         for title in list(self._plotter.scalar_bars.keys()):
             self._plotter.remove_scalar_bar(title)
-        self._plotter.add_mesh(
-            self._mesh, scalars=name, name="surface", culling="back", reset_camera=False, **_look(shown)
+        self._plotter.add_mesh(self._mesh, scalars=name, name="surface", reset_camera=False, **_look(shown))
+        seams = self._mesh.extract_feature_edges(
+            boundary_edges=True, feature_edges=False, manifold_edges=False, non_manifold_edges=False
         )
+        if seams.n_cells:
+            width_px = SEAM * self._plotter.window_size[0]
+            look = {**_look(shown), "lighting": False, "show_scalar_bar": False, "line_width": width_px}
+            self._plotter.add_mesh(seams, scalars=name, name="seams", reset_camera=False, **look)
+        self._show_within(self._within)
         for bar in self._plotter.scalar_bars.values():
             bar.DrawBackgroundOn()
             bar.GetBackgroundProperty().SetColor(*pv.Color(BACKGROUND).float_rgb)
@@ -189,6 +210,14 @@ class Stage:
         actor.prop.background_color = BACKGROUND
         actor.prop.background_opacity = CAPTION_OPACITY
 
+    def _show_within(self, within: bool) -> None:
+        """Draw the wall as it is seen from ``within``, or from outside."""
+        self._within = within
+        if "surface" in self._plotter.actors:
+            self._plotter.actors["surface"].prop.culling = "none" if within else "back"
+        if "seams" in self._plotter.actors:
+            self._plotter.actors["seams"].visibility = within
+
     def look_from_outside(self) -> None:
         """Across the tube's longest extent, with its bend in the picture's plane."""
         points = self._mesh.points
@@ -196,6 +225,7 @@ class Stage:
         _, _, axes = np.linalg.svd(
             points[:: max(len(points) // 20000, 1)] - points.mean(axis=0), full_matrices=False
         )
+        self._show_within(False)
         self._plotter.camera.view_angle = 30.0
         self._plotter.camera_position = [middle + 1000 * axes[2], middle, axes[1]]
         self._show_path(True)
@@ -207,6 +237,7 @@ class Stage:
         pose = self._inside
         if pose is None:
             return
+        self._show_within(True)
         self._plotter.camera_position = [pose[:3, 3], pose[:3, 3] + pose[:3, 2], -pose[:3, 1]]
         self._plotter.camera.view_angle = _height_degrees(self._camera)
         self._plotter.camera.clipping_range = (0.1, 1000.0)
@@ -227,14 +258,20 @@ class Stage:
         """Add the view to the poses in the file ``path``; the number of poses that it has then.
 
         Raises:
-            TrajectoryError: the file exists and is no pose file.
+            TrajectoryError: the file exists and is no pose file, or the view is none from within the lumen.
         """
         poses = self.view_pose()[None]
+        if not self._lumen.outlook(self._camera, poses).inside[0]:
+            raise TrajectoryError("the view is not from within the lumen, looking at its wall; press i first")
         if path.exists():
             poses = np.concatenate([read_poses(path)[0], poses])
         with whole_file(path, overwrite=True) as beside:
             write_c3vd_poses(beside, poses)
         return len(poses)
+
+    @cached_property
+    def _lumen(self) -> Lumen:
+        return Lumen(self._surface)
 
     def open_window(self, name: str, keyframes: Path) -> None:
         """Show the window until it is closed; the key k adds its view to the pose file ``keyframes``."""

@@ -8,9 +8,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from endotwin.errors import OutputError
 from endotwin.look.inspector import Map, Stage, twin_maps
-from endotwin.run.output import check_picture, whole_file
+from endotwin.run.output import check_picture
+from endotwin.sequence.images import write_png
 from endotwin.synth.encodings import encode_color
 from endotwin.synth.job import Job
 from endotwin.synth.labels import Labeller
@@ -41,9 +41,7 @@ def preview(job: Job, out: Path | str, overwrite: bool = False) -> str:
     tile = (sheet.shape[1], sheet.shape[1] // 2)
     stage = Stage(job.twin, _map_of(job.twin), True, poses, FRUSTA, tile)
     mesh = stage.contact_sheet(list(_map_of(job.twin)), inside=False)
-    with whole_file(out, overwrite) as beside:
-        if not cv2.imwrite(str(beside), np.vstack([mesh, sheet])[..., ::-1]):
-            raise OutputError(f"{out} cannot be written; is the disk full?")
+    write_png(out, np.vstack([mesh, sheet]), overwrite)
     counts = job.trajectory.counts
     told = ", ".join(f"{count} {name}" for name, count in counts.items() if name != "asked" and count)
     return f"{out}: {len(poses)} poses{f' ({told})' if told else ''}, {job.trajectory.description}"

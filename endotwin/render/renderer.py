@@ -6,32 +6,39 @@ from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 
 import cv2
 import numpy as np
 import torch
 
 from endotwin.cameras import Camera
-from endotwin.errors import TwinError
+from endotwin.errors import OptionError, TwinError
 from endotwin.light import shading
 from endotwin.light.incidence import to_camera
 from endotwin.render.illumination import Illumination, ViewLight
+from endotwin.sequence.poses import as_poses
 from endotwin.surface.casting import Caster, Correspondences
 from endotwin.surface.silhouettes import discontinuities
-from endotwin.twin import Twin
+from endotwin.surface.vectors import dot
+from endotwin.twin import Twin, as_twin
 
 SUBPIXELS = 2
 """A pixel at a silhouette or a shadow's edge is the mean of SUBPIXELS² rays."""
 
+FACING = 0.05
+"""Least cosine between normal and ray of a surface that shows its colour. At the rim of a fold less of it
+than a hundredth of a pixel is steeper: what is there in a mesh is the back of a sliver, a black dot."""
 
-@dataclass(frozen=True)
+
+@dataclass(frozen=True, eq=False)
 class Rays:
     """Viewing rays that need no camera: unit ``pixel_directions`` float32 [..., 3] in the camera frame."""
 
     pixel_directions: np.ndarray
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class View:
     """One rendered view and the labels that come with it.
 
@@ -86,18 +93,19 @@ class Renderer:
     """Renders views of one fitted twin through one camera; may be called from several threads.
 
     Args:
-        camera: the twin's own unless given. threads: of the ray casting.
+        twin: or its folder. camera: the twin's own unless given. threads: of the ray casting.
         caster: one of the same surface, to share. exposure: factor on the radiance, one or one a channel.
     """
 
     def __init__(
         self,
-        twin: Twin,
+        twin: Twin | Path | str,
         camera: Camera | None = None,
         threads: int = 2,
         caster: Caster | None = None,
         exposure: Sequence[float] | float = 1.0,
     ):
+        twin = as_twin(twin)
         if not twin.fitted:
             raise TwinError("the twin has no materials yet; run 'endotwin fit' on it first")
         self.twin = twin
@@ -123,18 +131,27 @@ class Renderer:
         Colours of pixels at silhouettes and shadow edges (and of those beside the mask's edge), and only
         those, are means over the pixel's area; labels are of its centre. ``exposure`` is a factor on the
         radiance of this view.
+
+        Raises:
+            TrajectoryError: that is no rigid pose. OptionError: the mask has another shape than the image.
         """
+        (T_world_camera,) = as_poses(T_world_camera)
         shape = (self.camera.height, self.camera.width)
+        if mask is not None and np.shape(mask) != shape:
+            raise OptionError(f"the mask has the shape {np.shape(mask)}, but the image {shape}")
         light = self._illumination.at(T_world_camera)
-        hits, normals, radiance, visible = self._cast(self.camera, light, T_world_camera, mask)
+        hits, normals, radiance, facing, visible = self._cast(self.camera, light, T_world_camera, mask)
         radiance = laid_out(radiance, hits.pixel, shape)
         distance_mm = laid_out(hits.distance_mm, hits.pixel, shape)
-        edges = discontinuities(distance_mm)
+        told = laid_out(facing, hits.pixel, shape)
+        edges = discontinuities(distance_mm) | ((distance_mm > 0) & ~told)
         if visible is not None:
             edges |= shadow_edges(laid_out(visible, hits.pixel, shape))
         edges &= self._sees if mask is None else mask
-        radiance[edges] = self._mean_radiance(np.argwhere(edges)[:, ::-1], light, T_world_camera)
-        _close_slits(radiance, distance_mm > 0, edges)
+        mean, count = self._mean_radiance(np.argwhere(edges)[:, ::-1], light, T_world_camera)
+        radiance[edges] = np.where(count[:, None] > 0, mean, radiance[edges])
+        told[edges] |= count > 0
+        _close_slits(radiance, told, edges)
         radiance *= self._exposure * exposure
         if self._transmission is not None:
             radiance *= self._transmission
@@ -160,20 +177,19 @@ class Renderer:
         """Bool [H, W]: pixels through which the lens sees at all."""
         return np.isfinite(self.camera.pixel_directions).all(axis=2)
 
-    def _mean_radiance(self, uv: np.ndarray, light: ViewLight, T_world_camera: np.ndarray) -> np.ndarray:
-        """Radiance float32 [N, 3], averaged over what is seen of the surface in the area of pixels ``uv``
-        [N, 2].
-
-        A slit that no depth map saw, behind the rim of a fold, would else be a black dot. No surface is
-        black.
-        """
+    def _mean_radiance(
+        self, uv: np.ndarray, light: ViewLight, T_world_camera: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Radiance float32 [N, 3], averaged over the rays in the area of pixels ``uv`` [N, 2] that meet a
+        surface which faces them, and how many do, [N]."""
         inside = (np.arange(SUBPIXELS) + 0.5) / SUBPIXELS - 0.5
         offsets = np.stack(np.meshgrid(inside, inside), axis=-1).reshape(-1, 2)
         rays = Rays(self.camera.directions(uv[:, None] + offsets).astype(np.float32))
-        hits, _, radiance, _ = self._cast(rays, light, T_world_camera)
-        total = laid_out(radiance, hits.pixel, (len(uv), len(offsets))).sum(axis=1)
-        count = np.bincount(hits.pixel // len(offsets), minlength=len(uv)).astype(np.float32)
-        return total / np.maximum(count, 1)[:, None]
+        hits, _, radiance, facing, _ = self._cast(rays, light, T_world_camera)
+        pixel = hits.pixel[facing]
+        total = laid_out(radiance[facing], pixel, (len(uv), len(offsets))).sum(axis=1)
+        count = np.bincount(pixel // len(offsets), minlength=len(uv)).astype(np.float32)
+        return total / np.maximum(count, 1)[:, None], count
 
     def _cast(
         self,
@@ -181,16 +197,17 @@ class Renderer:
         light: ViewLight,
         T_world_camera: np.ndarray,
         mask: np.ndarray | None = None,
-    ) -> tuple[Correspondences, np.ndarray, np.ndarray, np.ndarray | None]:
-        """Hits [N], their unit normals in the camera frame [N, 3], their radiance [N, 3], and which light
-        guides they see [N, K] (None where no shadow is cast)."""
+    ) -> tuple[Correspondences, np.ndarray, np.ndarray, np.ndarray, np.ndarray | None]:
+        """Hits [N], their unit normals in the camera frame [N, 3], their radiance [N, 3], whether they face
+        their ray [N], and which light guides they see [N, K] (None where no shadow is cast)."""
         hits = self.caster.cast(rays, T_world_camera, mask)
         mixed = hits.interpolate(self.twin.surface, self._normal_and_material)
         normals = to_camera(mixed[:, :3], T_world_camera)
         radiance, visible = light.radiance(
             hits, rays.pixel_directions, normals, torch.from_numpy(mixed[:, 3:])
         )
-        return hits, normals, radiance.numpy(), visible
+        facing = -dot(normals, rays.pixel_directions.reshape(-1, 3).take(hits.pixel, axis=0)) > FACING
+        return hits, normals, radiance.numpy(), facing, visible
 
 
 def _normal_and_material(twin: Twin) -> np.ndarray:
@@ -200,17 +217,17 @@ def _normal_and_material(twin: Twin) -> np.ndarray:
     return np.concatenate([twin.surface.normals, *columns], axis=1)
 
 
-def _close_slits(radiance: np.ndarray, seen: np.ndarray, edges: np.ndarray) -> None:
-    """Give black ones of the ``edges`` [H, W] that lie in gaps, of one or two pixels, between those that are
-    ``seen`` [H, W] the mean ``radiance`` [H, W, 3] of the seen ones about them.
+def _close_slits(radiance: np.ndarray, told: np.ndarray, edges: np.ndarray) -> None:
+    """Give those of the ``edges`` [H, W] that lie in gaps, of one or two pixels, between those whose colour
+    is ``told`` [H, W] the mean ``radiance`` [H, W, 3] of the told ones about them.
 
     Through such a slit, behind the rim of a fold, no depth map saw; but no surface is black.
     """
-    closed = cv2.morphologyEx(seen.view(np.uint8), cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8)) > 0
-    slits = np.nonzero(closed & ~seen & edges & ~radiance.any(axis=2))
+    closed = cv2.morphologyEx(told.view(np.uint8), cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8)) > 0
+    slits = np.nonzero(closed & ~told & edges)
     if len(slits[0]):
-        count = cv2.boxFilter(seen.astype(np.float32), -1, (3, 3), normalize=False)
-        total = cv2.boxFilter(radiance * seen[..., None], -1, (3, 3), normalize=False)
+        count = cv2.boxFilter(told.astype(np.float32), -1, (3, 3), normalize=False)
+        total = cv2.boxFilter(radiance * told[..., None], -1, (3, 3), normalize=False)
         radiance[slits] = total[slits] / np.maximum(count[slits], 1)[:, None]
 
 

@@ -1,1 +1,1 @@
-"""What every job needs, whatever it works on: files written whole, threads, clocks."""
+"""What every job needs, whatever it works on: files written whole, worker processes, threads, clocks."""

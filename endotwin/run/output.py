@@ -1,13 +1,20 @@
-"""Outputs are written whole or not at all: beside their place, then moved into it.
+"""Outputs are written whole or not at all: beside their place, then moved into it by one rename.
 
-Only what endotwin wrote is ever replaced: a folder is known by the file that marks its kind.
+Only what endotwin wrote is ever replaced: a folder is known by the file that marks its kind. What a killed
+run left half written lies under names that begin with ``HIDDEN``, and the next run that writes there removes
+it.
 """
 
 from __future__ import annotations
 
+import errno
+import fcntl
+import filecmp
 import os
+import re
 import shutil
-from collections.abc import Iterable, Iterator
+import tempfile
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
@@ -15,6 +22,9 @@ from endotwin.errors import OutputError
 
 TWIN, DATASET, TRADEOFF = "twin.json", "dataset.json", "ladder.json"
 """Marks of the folders that endotwin writes."""
+
+HIDDEN = ".endotwin-"
+IN_PYTHON = "in Python overwrite=True"
 
 
 def check_free(path: Path, overwrite: bool, mark: str | None = None) -> None:
@@ -28,7 +38,7 @@ def check_free(path: Path, overwrite: bool, mark: str | None = None) -> None:
     if path.exists():
         _check_own(path, mark)
         if not overwrite:
-            raise OutputError(f"{path} exists already; choose another name or pass --overwrite")
+            raise OutputError(f"{path} exists already; choose another name or pass --overwrite ({IN_PYTHON})")
     places = [path, *path.absolute().parents] if mark else path.absolute().parents
     existing = next(place for place in places if place.exists())
     if not existing.is_dir() or not os.access(existing, os.W_OK):
@@ -73,65 +83,199 @@ def _parents_made(path: Path) -> Iterator[None]:
         raise
 
 
+def unwritable(path: Path, error: OSError) -> OutputError:
+    """``error`` as a sentence that names ``path`` and, where room is what lacks, how much there is."""
+    if error.errno not in (errno.ENOSPC, errno.EDQUOT):
+        return OutputError(f"{path} cannot be written ({error.strerror or error}); check its folder and disk")
+    place = next(place for place in Path(path).absolute().parents if place.exists())
+    free_mb = shutil.disk_usage(place).free / 1e6
+    return OutputError(f"{path} cannot be written: the disk is full ({free_mb:.1f} MB free); make room")
+
+
 @contextmanager
-def whole_folder(path: Path, files: tuple[str, ...], overwrite: bool = False) -> Iterator[Path]:
-    """A new folder to fill, which becomes ``path`` when the block ends well and vanishes when it does not.
-
-    Of a folder that is there already, only ``files`` are replaced: what others put there is theirs, and a
-    shell may stand in it.
-
-    Args:
-        files: what a folder of this kind may hold; the first marks the kind.
-    """
-    check_free(path, overwrite, files[0])
-    target = Path(path).resolve()
-    beside = target.with_name(f".{target.name}.{os.getpid()}.part")
-    with _parents_made(beside):
-        beside.mkdir()
-        try:
-            yield beside
-            check_free(path, overwrite, files[0])
-            if target.exists():
-                _exchange(beside, target, files)
-            else:
-                beside.rename(target)
-        finally:
-            shutil.rmtree(beside, ignore_errors=True)
-
-
-def _exchange(new: Path, folder: Path, files: tuple[str, ...]) -> None:
-    """Move what ``new`` holds into ``folder`` in place of ``files``; if that fails, all is as it was.
-
-    The mark goes first and comes last, so that a run that is killed leaves no mixture that looks whole.
-    """
-    arriving = sorted((entry.name for entry in new.iterdir()), key=lambda name: name == files[0])
-    leaving = [name for name in dict.fromkeys([*files, *arriving]) if (folder / name).exists()]
-    old = new.with_suffix(".old")
-    old.mkdir()
-    moves = [(folder / name, old / name) for name in leaving]
-    moves += [(new / name, folder / name) for name in arriving]
+def _told(path: Path) -> Iterator[None]:
+    """Whatever the system refuses in the block is told of ``path``."""
     try:
-        for source, target in moves:
-            source.rename(target)
-    except BaseException:
-        for source, target in reversed(moves):
-            if target.exists() and not source.exists():
-                target.rename(source)
-        old.rmdir()
-        raise
-    shutil.rmtree(old)
+        yield
+    except OSError as error:
+        raise unwritable(path, error) from error
 
 
 @contextmanager
 def whole_file(path: Path, overwrite: bool = False) -> Iterator[Path]:
-    """A path to write to, which becomes ``path`` when the block ends well and vanishes when it does not."""
+    """A path to write to, which becomes ``path`` when the block ends well and vanishes when it does not.
+
+    Raises:
+        OutputError: ``path`` exists and ``overwrite`` is false, or it cannot be written.
+    """
     path = Path(path)
     check_free(path, overwrite)
-    beside = path.absolute().with_name(f".{os.getpid()}.part.{path.name}")
-    with _parents_made(beside):
+    with _told(path), _parents_made(path), _workplace(path.absolute().parent) as work:
+        beside = work / path.name
+        yield beside
+        _settle(beside)
+        beside.replace(path)
+        _settle(path.absolute().parent)
+
+
+def write_folder(
+    path: Path, files: Mapping[str, bytes], mark: str, own: re.Pattern, overwrite: bool = False
+) -> None:
+    """Make the folder ``path`` of ``files`` by name, or turn the one that is there into that.
+
+    At every instant the folder is what it was or what it shall be: the rename of ``mark`` decides. So any
+    other name must stand for one content only, whatever the mark says. What others put into the folder stays.
+
+    Args:
+        mark: the file without which the folder is not endotwin's. own: names that are endotwin's in it; those
+            that ``files`` lacks are removed.
+
+    Raises:
+        OutputError: ``path`` exists and ``overwrite`` is false, it is something else, or cannot be written.
+    """
+    check_free(path, overwrite, mark)
+    target = Path(path).resolve()
+    with _told(path):
+        if target.is_dir():
+            _exchange(target, files, mark, own)
+            return
+        with _parents_made(target), _workplace(target.parent) as work:
+            new = work / target.name
+            new.mkdir()
+            for name, content in files.items():
+                _write(new / name, content)
+            _settle(new)
+            new.rename(target)
+            _settle(target.parent)
+
+
+def move_folder(new: Path, path: Path, own: Callable[[Path], bool]) -> None:
+    """Put the whole folder ``new`` in the place of ``path``, whose files that are not ``own`` go with it.
+
+    Until its last rename ``new`` is whole beside ``path``, and a run that was killed can do the same again.
+
+    Args:
+        own: whether a file of ``path``, by its relative path, is endotwin's to replace.
+
+    Raises:
+        OutputError: a file that is not would be lost; OSError: as the system has it.
+    """
+    path = Path(path).absolute()
+    with _workplace(path.parent) as aside:
+        if path.exists():
+            _adopt(path, new, own)
+            path.rename(aside / path.name)
         try:
-            yield beside
-            beside.replace(path)
+            new.rename(path)
         except BaseException:
-            beside.unlink(missing_ok=True)
+            with suppress(OSError):
+                (aside / path.name).rename(path)
             raise
+
+
+def _adopt(old: Path, new: Path, own: Callable[[Path], bool]) -> None:
+    """Link files of ``old`` that are not ``own`` into ``new``, or copy them where that cannot be."""
+    files = (file for file in old.rglob("*") if file.is_symlink() or not file.is_dir())
+    for file in files:
+        name = file.relative_to(old)
+        target = new / name
+        if own(name):
+            continue
+        if target.exists():
+            if target.samefile(file) or filecmp.cmp(target, file, shallow=False):
+                continue  # a run that was killed came so far
+            raise OutputError(f"{file} is not endotwin's to replace; move it to another place")
+        target.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            os.link(file, target, follow_symlinks=False)
+        except OSError:
+            part = target.with_name(f"{HIDDEN}{target.name}")
+            shutil.copy2(file, part, follow_symlinks=False)
+            part.replace(target)
+
+
+def _exchange(folder: Path, files: Mapping[str, bytes], mark: str, own: re.Pattern) -> None:
+    """``write_folder`` into a folder that is there."""
+    with _locked(folder):
+        kept = set(os.listdir(folder))
+        fresh = [name for name in files if name != mark and not _holds(folder / name, files[name])]
+        try:
+            for name in [*fresh, mark]:
+                _write(folder / f"{HIDDEN}{name}", files[name])
+            for name in fresh:
+                (folder / f"{HIDDEN}{name}").replace(folder / name)
+            _settle(folder)
+            (folder / f"{HIDDEN}{mark}").replace(folder / mark)
+            kept = set(files)
+            _settle(folder)
+        finally:
+            for name in set(os.listdir(folder)) - kept:
+                if own.fullmatch(name.removeprefix(HIDDEN)):
+                    (folder / name).unlink()
+
+
+def _holds(file: Path, content: bytes) -> bool:
+    return file.is_file() and file.read_bytes() == content
+
+
+def _write(file: Path, content: bytes) -> None:
+    """Write a file through to the disk."""
+    with file.open("wb") as opened:
+        opened.write(content)
+        opened.flush()
+        os.fsync(opened.fileno())
+
+
+def _settle(place: Path) -> None:
+    """Wait until what was written to a file, or which names a folder has, is on the disk."""
+    descriptor = os.open(place, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+@contextmanager
+def _workplace(folder: Path) -> Iterator[Path]:
+    """A hidden folder in ``folder`` to write in, gone after the block, as are those of runs that were
+    killed."""
+    with _locked(folder):
+        for left in folder.glob(f"{HIDDEN}*/"):
+            _remove_abandoned(left)
+        work = Path(tempfile.mkdtemp(prefix=HIDDEN, dir=folder))
+        held = _lock(work, fcntl.LOCK_EX)
+    try:
+        yield work
+    finally:
+        shutil.rmtree(work, ignore_errors=True)
+        os.close(held)
+
+
+def _remove_abandoned(work: Path) -> None:
+    """Remove a workplace unless its run is alive, which holds its lock."""
+    with suppress(OSError):
+        os.close(_lock(work, fcntl.LOCK_EX | fcntl.LOCK_NB))
+        shutil.rmtree(work, ignore_errors=True)
+
+
+@contextmanager
+def _locked(folder: Path) -> Iterator[None]:
+    """No other run enters such a block of the same folder meanwhile."""
+    descriptor = _lock(folder, fcntl.LOCK_EX)
+    try:
+        yield
+    finally:
+        os.close(descriptor)
+
+
+def _lock(folder: Path, how: int) -> int:
+    """A descriptor of ``folder`` that holds its lock until it is closed. Raises OSError where it is held and
+    ``how`` says not to wait, or where the file system has no locks and it would not be told."""
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        fcntl.flock(descriptor, how)
+    except OSError:
+        if how & fcntl.LOCK_NB:
+            os.close(descriptor)
+            raise
+    return descriptor

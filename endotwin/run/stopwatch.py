@@ -17,7 +17,10 @@ def peak_memory_mb() -> float:
     """
     status = Path("/proc/self/status")
     if status.exists():
-        line = next((line for line in status.read_text().splitlines() if line.startswith("VmHWM:")), None)
+        line = next(
+            (line for line in status.read_text(encoding="utf-8").splitlines() if line.startswith("VmHWM:")),
+            None,
+        )
         if line is not None:
             return int(line.split()[1]) * 1024 / 1e6
     unit_bytes = 1 if sys.platform == "darwin" else 1024

@@ -5,10 +5,9 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Callable, Iterator
-from concurrent.futures import ProcessPoolExecutor
 from importlib import import_module
-from multiprocessing import get_context
 
+from endotwin.run.processes import Pool
 from endotwin.selfcheck.finding import Finding
 
 __all__ = ["GROUPS", "Finding", "run_checks"]
@@ -42,7 +41,7 @@ def _all_found(checks: list[tuple[str, int]]) -> Iterator[list[Finding]]:
     if PROCESSES == 1:
         yield from (_found(*check) for check in checks)
         return
-    with ProcessPoolExecutor(PROCESSES, get_context("spawn")) as pool:
+    with Pool(PROCESSES) as pool:
         yield from (result.result() for result in [pool.submit(_found, *check) for check in checks])
 
 

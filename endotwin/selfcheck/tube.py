@@ -99,7 +99,7 @@ class Tube:
             )
         camera = {"w": width, "h": height, "fl_x": 0.6 * width, "fl_y": 0.6 * width}
         document = {"unit": "mm", "depth_unit_scale_factor": 1.0, **camera, "frames": frames}
-        (folder / "transforms.json").write_text(json.dumps(document))
+        (folder / "transforms.json").write_text(json.dumps(document), encoding="utf-8")
         return folder
 
 

@@ -12,14 +12,19 @@ from threading import Lock
 import cv2
 import numpy as np
 import tifffile
+from PIL import Image
 
 from endotwin.errors import SequenceError
+from endotwin.run.output import whole_file
+from endotwin.sequence import floatdepth
 
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 JPEG_SIGNATURE, JPEG_END = b"\xff\xd8", b"\xff\xd9"
 TIFF_SIGNATURES = (b"II*\x00", b"MM\x00*", b"II+\x00", b"MM\x00+")
 TIFF_OWN_COMPRESSIONS = (1, 8, 32946)  # none and deflate, which tifffile decodes by itself
+LARGEST_PIXELS = 1 << 30  # that OpenCV decodes
 TRAILING_BYTES = 64  # what may follow the end marker of a complete JPEG
+EXIF_ORIENTATION = 0x0112
 OPENCV_LOG = Lock()  # its level is one for the whole process
 
 # A damaged file is told in our own error; without a handler, tifffile's log of it would go to stderr as well.
@@ -29,33 +34,55 @@ logging.getLogger("tifffile").addHandler(logging.NullHandler())
 def read_color(path: Path) -> np.ndarray:
     """A photo, uint8 [H, W, 3], RGB. Raises SequenceError where the file is damaged or no image."""
     content = _complete_bytes(path)
-    image = None
-    if _is_tiff(content):
-        image = _decode_tiff(path, content, cv2.IMREAD_COLOR)
-    elif len(content):
-        image = cv2.imdecode(content, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
-    if image is None:
-        raise _damaged(path)
+    image = _decoded(path, content, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
     return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+
+
+def write_png(path: Path, image: np.ndarray, overwrite: bool = False) -> None:
+    """Write uint8 [H, W, 3], RGB, as the PNG file ``path``, whole or not at all; raises OutputError."""
+    content = cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))[1].tobytes()
+    with whole_file(path, overwrite) as beside:
+        beside.write_bytes(content)
 
 
 def read_plane(path: Path) -> np.ndarray:
     """A depth file as stored, [H, W]; of several channels, the first. Raises SequenceError where damaged."""
-    if path.suffix.lower() == ".npy":
-        return _read_npy(path)
-    content = _complete_bytes(path)
-    plane = None
-    if _is_tiff(content):
-        plane = _decode_tiff(path, content, cv2.IMREAD_UNCHANGED)
-    elif len(content):
-        plane = cv2.imdecode(content, cv2.IMREAD_UNCHANGED)
-    if plane is None or not plane.size:
-        raise _damaged(path)
+    if path.suffix.lower() in floatdepth.SUFFIXES:
+        return floatdepth.read_array(path)
+    plane = _decoded(path, _complete_bytes(path), cv2.IMREAD_UNCHANGED)
     return plane if plane.ndim == 2 else np.ascontiguousarray(plane[..., 0])
+
+
+def orientation(path: Path) -> int:
+    """How a photo's EXIF says that it is to be turned, 1 to 8; 1, not at all, where it says nothing."""
+    try:
+        with Image.open(path) as photo:
+            return int(photo.getexif().get(EXIF_ORIENTATION, 1))
+    except (OSError, ValueError, TypeError, SyntaxError, Image.DecompressionBombError):
+        return 1
+
+
+def _decoded(path: Path, content: np.ndarray, mode: int) -> np.ndarray:
+    """The image in a file's bytes; raises SequenceError where there is none, or one too large to hold."""
+    image = None
+    try:
+        if _is_tiff(content):
+            image = _decode_tiff(path, content, mode)
+        elif len(content):
+            image = cv2.imdecode(content, mode)
+    except (cv2.error, MemoryError) as error:
+        raise _endless(path) from error
+    if image is None or not image.size:
+        raise _damaged(path)
+    return image
 
 
 def _damaged(path: Path) -> SequenceError:
     return SequenceError(f"{path} is truncated or not an image; copy or download the file again")
+
+
+def _endless(path: Path) -> SequenceError:
+    return SequenceError(f"{path} says that it is larger than any image, or empty; copy the file again")
 
 
 def _complete_bytes(path: Path) -> np.ndarray:
@@ -64,8 +91,11 @@ def _complete_bytes(path: Path) -> np.ndarray:
         content = path.read_bytes()
     except OSError as error:
         raise SequenceError(f"{path} cannot be read ({error.strerror}); check the file") from error
-    if content.startswith(PNG_SIGNATURE) and not _png_is_whole(content):
-        raise _damaged(path)
+    if content.startswith(PNG_SIGNATURE):
+        if not _png_is_whole(content):
+            raise _damaged(path)
+        if not 0 < _png_pixels(content) <= LARGEST_PIXELS:
+            raise _endless(path)
     if content.startswith(JPEG_SIGNATURE) and JPEG_END not in content[-TRAILING_BYTES:]:
         raise _damaged(path)
     return np.frombuffer(content, np.uint8)
@@ -86,6 +116,12 @@ def _png_is_whole(content: bytes) -> bool:
             return True
         position = end + 4
     return False
+
+
+def _png_pixels(content: bytes) -> int:
+    """How many pixels a whole PNG file says that it has: libpng would print that they are too many."""
+    width, height = struct.unpack_from(">II", content, len(PNG_SIGNATURE) + 8)
+    return width * height
 
 
 def _is_tiff(content: np.ndarray) -> bool:
@@ -111,15 +147,3 @@ def _decode_tiff(path: Path, content: np.ndarray, mode: int) -> np.ndarray | Non
             return cv2.imdecode(content, mode)
         finally:
             cv2.utils.logging.setLogLevel(level)
-
-
-def _read_npy(path: Path) -> np.ndarray:
-    try:
-        plane = np.squeeze(np.load(path, allow_pickle=False))
-    except Exception as error:  # NumPy parses the header as Python, and raises whatever that does
-        raise SequenceError(f"{path} is truncated or not a NumPy array; copy the file again") from error
-    if plane.ndim != 2:
-        raise SequenceError(f"{path} has the shape {plane.shape}; write it as [height, width]")
-    if plane.dtype.kind not in "uif":
-        raise SequenceError(f"{path} holds {plane.dtype}, which is no depth; write numbers")
-    return plane

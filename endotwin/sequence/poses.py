@@ -100,6 +100,25 @@ def rigid(matrices: np.ndarray, where: Callable[[int], str]) -> np.ndarray:
     return matrices
 
 
+def as_poses(given: object) -> np.ndarray:
+    """Poses float64 [N, 4, 4] from anything that NumPy reads as matrices [N, 4, 4], or as one [4, 4].
+
+    Raises:
+        TrajectoryError: it does not, or they are not rigid.
+    """
+    try:
+        matrices = np.array(given, np.float64)
+    except (TypeError, ValueError):
+        matrices = np.zeros(0)
+    if matrices.ndim not in (2, 3) or matrices.shape[-2:] != (4, 4) or not matrices.size:
+        shape = getattr(given, "shape", type(given).__name__)
+        raise TrajectoryError(f"poses are matrices [N, 4, 4], camera to world in mm, and not {shape}")
+    try:
+        return rigid(matrices, lambda i: f"pose {i}")
+    except SequenceError as error:
+        raise TrajectoryError(str(error)) from error
+
+
 def from_quaternions(
     positions_mm: np.ndarray, quaternions: np.ndarray, where: Callable[[int], str]
 ) -> np.ndarray:
@@ -164,7 +183,7 @@ def read_transforms_poses(path: Path) -> tuple[np.ndarray, list[dict]]:
 def transforms_unit_mm(content: dict, path: Path) -> float:
     """Millimetres in the unit of the ``content`` of the ``transforms.json`` at ``path``."""
     unit = content.get("unit", "m")
-    if unit not in MM_PER_UNIT:
+    if not isinstance(unit, str) or unit not in MM_PER_UNIT:
         raise SequenceError(f"{path} has the unit {unit!r}; set 'unit' to one of {', '.join(MM_PER_UNIT)}")
     return MM_PER_UNIT[unit]
 
@@ -194,7 +213,7 @@ def numeric_rows(path: Path, columns: int, valid_row: str) -> tuple[np.ndarray, 
 def read_text(path: Path) -> str:
     """The text of a file; raises SequenceError where it cannot be read as text."""
     try:
-        return path.read_text(encoding="utf-8")
+        return path.read_text(encoding="utf-8-sig")
     except FileNotFoundError as error:
         raise SequenceError(f"There is no file {path}; check the path or add the file") from error
     except (OSError, UnicodeDecodeError) as error:

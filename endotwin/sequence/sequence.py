@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
@@ -12,7 +13,7 @@ import numpy as np
 
 from endotwin.cameras.base import Camera
 from endotwin.errors import SequenceError
-from endotwin.sequence.images import read_color
+from endotwin.sequence.images import orientation, read_color
 
 SURROUND_FRAMES = 8
 SURROUND_LEVEL = 3  # of 255, the brightest that noise makes a black pixel
@@ -23,8 +24,10 @@ RINGING_PX = 23  # how far it reaches: across a block of 16 × 16, whose chroma 
 HALO_PX = 3  # within the circle, where sharpening and chroma at half size mix its edge with the black
 DEPTH_SPREAD = 0.02
 
+logger = logging.getLogger("endotwin")
 
-@dataclass(frozen=True)
+
+@dataclass(frozen=True, eq=False)
 class Frame:
     """One photo with its depth and pose, in memory.
 
@@ -43,7 +46,7 @@ class Frame:
     T_world_camera: np.ndarray
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Sequence:
     """A posed RGB-D sequence; frames are read when asked for and never kept.
 
@@ -93,6 +96,12 @@ class Sequence:
                 "add or remove poses until there is one a frame"
             )
         self._native_color(0)
+        if (turned := orientation(self.color_files[0])) != 1:
+            logger.warning(
+                "%s is marked as turned (EXIF orientation %d), which is not heeded: camera, pose and depth "
+                "belong to the pixels as they are stored",
+                *(self.color_files[0], turned),
+            )
 
     def color(self, index: int) -> np.ndarray:
         """Photo ``index``, uint8 [H, W, 3], RGB."""

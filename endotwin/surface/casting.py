@@ -25,7 +25,7 @@ NUDGE = 1e-6 * np.array([0.36, 0.48, -0.8], np.float32)
 much aside."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Correspondences:
     """Pixel → surface correspondences of one view; only pixels whose ray hits are listed.
 

@@ -8,10 +8,10 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 import numpy as np
-from safetensors.numpy import load_file, save_file
+from safetensors.numpy import load_file, save
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Surface:
     """A triangle mesh about a local origin, so that float32 stays exact wherever the world's origin is.
 
@@ -74,12 +74,12 @@ class Surface:
         """The same surface with other coverage [V] each."""
         return replace(self, seen_by=seen_by, nearest_mm=nearest_mm)
 
-    def save(self, path: Path) -> None:
-        """Write all arrays as they are to a ``.safetensors`` file."""
-        save_file({name: np.ascontiguousarray(value) for name, value in vars(self).items()}, path)
+    def to_bytes(self) -> bytes:
+        """All arrays as they are, as the content of a ``.safetensors`` file."""
+        return save({name: np.ascontiguousarray(value) for name, value in vars(self).items()})
 
     @classmethod
     def load(cls, path: Path) -> Surface:
-        """Read what ``save`` wrote; arrays that a surface no longer has are passed over."""
+        """Read a file of what ``to_bytes`` gave; arrays that a surface no longer has are passed over."""
         arrays = load_file(path)
         return cls(**{field.name: arrays[field.name] for field in fields(cls)})

@@ -113,6 +113,18 @@ def exr(**channels: np.ndarray) -> bytes:
     return file.getvalue()
 
 
+def npz(**arrays: np.ndarray) -> bytes:
+    """A compressed NPZ file of arrays by name; the same bytes at any time."""
+    file = BytesIO()
+    np.savez_compressed(file, **arrays)
+    return file.getvalue()
+
+
+def plane(image: np.ndarray, channel: int) -> np.ndarray:
+    """One channel of an image [H, W, C] as float32 [H, W]."""
+    return np.ascontiguousarray(image[..., channel], np.float32)
+
+
 def half(radiance: np.ndarray) -> np.ndarray:
     """Values as float16, to the nearest; those beyond its range are clipped."""
     return np.minimum(radiance, np.float32(HALF_MAX)).astype(np.float16, order="C")
@@ -129,6 +141,11 @@ _FLOW = (
     "seen "
     "or hidden"
 )
+_FLOW_FLOAT = (
+    "{container}, 32-bit float: x to the right and y down, px, without limit; NaN: none (no surface, no such "
+    "frame, or behind its lens); {way}, as in flow"
+)
+_BACK, _ON = "from this frame back to the previous one", "from this frame on to the next one"
 _HIDDEN = (
     "8-bit: 255: the pixel's surface point is hidden or out of the picture in the {other} frame; 128: there "
     "is no surface, or no such frame; 0: it is seen there"
@@ -138,7 +155,8 @@ ENCODINGS: dict[str, Encoding] = {
     "rgb": Encoding(
         ".png",
         lambda color: png(encode_color(color)),
-        "8-bit RGB, after the camera response; black where no surface is seen",
+        "8-bit RGB, after the camera response; black where no surface is seen, save in gaps of a pixel or "
+        "two within the surface, which take its colour: their depth is 0",
     ),
     "rgb_linear": Encoding(
         ".png",
@@ -184,15 +202,23 @@ ENCODINGS: dict[str, Encoding] = {
     "flow": Encoding(
         ".tiff",
         lambda flow_px: tiff(encode_flow(flow_px), SMOOTH_TIFF),
-        "16-bit, " + _FLOW.format(way="from this frame back to the previous one"),
+        "16-bit, " + _FLOW.format(way=_BACK),
     ),
     "flow_hidden": Encoding(".png", png, _HIDDEN.format(other="previous")),
     "flow_forward": Encoding(
         ".tiff",
         lambda flow_px: tiff(encode_flow(flow_px), SMOOTH_TIFF),
-        "16-bit, " + _FLOW.format(way="from this frame on to the next one"),
+        "16-bit, " + _FLOW.format(way=_ON),
     ),
     "flow_forward_hidden": Encoding(".png", png, _HIDDEN.format(other="next")),
+    **{
+        f"{name}_{suffix[1:]}": Encoding(suffix, encode, _FLOW_FLOAT.format(container=container, way=way))
+        for name, way in (("flow", _BACK), ("flow_forward", _ON))
+        for suffix, encode, container in (
+            (".exr", lambda flow_px: exr(X=plane(flow_px, 0), Y=plane(flow_px, 1)), "OpenEXR, channels X, Y"),
+            (".npz", lambda flow_px: npz(flow=flow_px.astype(np.float32)), "NumPy, array flow [H, W, 2]"),
+        )
+    },
     "occlusion": Encoding(
         ".png",
         png,

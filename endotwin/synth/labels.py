@@ -36,6 +36,10 @@ LABELS: dict[str, tuple[str, ...]] = {
     "diffuse": ("diffuse",),
     "flow": ("flow", "flow_hidden"),
     "flow_forward": ("flow_forward", "flow_forward_hidden"),
+    "flow_exr": ("flow_exr", "flow_hidden"),
+    "flow_forward_exr": ("flow_forward_exr", "flow_forward_hidden"),
+    "flow_npz": ("flow_npz", "flow_hidden"),
+    "flow_forward_npz": ("flow_forward_npz", "flow_forward_hidden"),
     "occlusion": ("occlusion",),
     "triangles": ("triangles",),
 }
@@ -190,13 +194,16 @@ class _Geometry:
         hides = hides_surface(self._points, self._hits, self._caster, self._T_world_camera)
         return self._image(np.where(hides, np.uint8(255), np.uint8(0)))
 
-    @property
+    @cached_property
     def flow(self) -> np.ndarray:
         return self._flow(self._index - 1)
 
-    @property
+    @cached_property
     def flow_forward(self) -> np.ndarray:
         return self._flow(self._index + 1)
+
+    flow_exr = flow_npz = property(lambda self: self.flow)
+    flow_forward_exr = flow_forward_npz = property(lambda self: self.flow_forward)
 
     @property
     def flow_hidden(self) -> np.ndarray:

@@ -98,7 +98,7 @@ def _cases(base: Rung, work: Path) -> Iterator[tuple[str, Rung]]:
 
 def decisions(rung: Rung, work: Path) -> dict[str, Decision]:
     """What the first fit of a rung decided."""
-    result = json.loads((work / "results" / f"{rung.name}.0.json").read_text())
+    result = json.loads((work / "results" / f"{rung.name}.0.json").read_text(encoding="utf-8"))
     return {name: Decision(**decision) for name, decision in result["effects"].items()}
 
 

@@ -52,7 +52,7 @@ def timed(arguments: list[str], files: Iterable[Path], work: Path) -> tuple[str,
     if done.returncode:
         said = done.stderr.strip().splitlines() or ["nothing"]
         raise RungError(f"endotwin {' '.join(arguments)} failed and said: {said[-1]}")
-    return done.stdout, {**json.loads(profile.read_text()), "seconds": seconds}
+    return done.stdout, {**json.loads(profile.read_text(encoding="utf-8")), "seconds": seconds}
 
 
 def measured(commands: list[list[str]], files: Sequence[Path], work: Path) -> dict:
@@ -112,16 +112,16 @@ def due(rung: Rung, repeat: int, work: Path) -> tuple[Path, dict, str] | None:
     if kept(result, asked):
         return None
     file = work / "rungs" / f"{rung.name}.yaml"
-    file.write_text(to_yaml(rung.config))
+    file.write_text(to_yaml(rung.config), encoding="utf-8")
     return result, asked, rung.given or str(file.resolve())
 
 
 def kept(path: Path, asked: dict) -> bool:
     """Whether ``path`` holds what was measured for ``asked``."""
-    return path.exists() and json.loads(path.read_text()).items() >= asked.items()
+    return path.exists() and json.loads(path.read_text(encoding="utf-8")).items() >= asked.items()
 
 
 def keep(result: dict, path: Path) -> None:
     """Write one measurement whole or not at all."""
     with whole_file(path, overwrite=True) as file:
-        file.write_text(json.dumps(result, indent=1) + "\n")
+        file.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from endotwin.errors import OutputError
-from endotwin.run.output import TRADEOFF, check_free
+from endotwin.run.output import TRADEOFF, check_free, move_folder, unwritable
 from endotwin.sequence import Sequence
 from endotwin.sequence.readers import open_sequence
 from endotwin.tradeoff import crops, effects, plot, report
@@ -22,6 +22,8 @@ from endotwin.twin import Source
 Progress = Callable[[str, int, int], None]
 
 PARTIAL = ".partial"
+OWN = ("tradeoff", "effects", "ladder", "rungs", "results", "crops")
+"""First parts of the names that a finished folder holds."""
 
 
 def tradeoff(
@@ -54,6 +56,25 @@ def tradeoff(
     sequence = open_sequence(path)
     sequence.require_valid_depth()
     work = out.with_name(out.name + PARTIAL)
+    try:
+        return _climbed(sequence, path, work, out, rungs, repeats, geometry, progress, base)
+    except OSError as error:
+        told = unwritable(Path(error.filename or work), error)
+        raise OutputError(f"{told}; the same command goes on from {work}") from error
+
+
+def _climbed(
+    sequence: Sequence,
+    path: Path,
+    work: Path,
+    out: Path,
+    rungs: list[Rung],
+    repeats: int,
+    geometry: str,
+    progress: Progress | None,
+    base: Rung | None,
+) -> tuple[list[dict], list[dict]]:
+    """What ``tradeoff`` does, in the folder ``work`` and at last in ``out``."""
     _enter(work, {"sequence": str(path.resolve()), "geometry": geometry})
     patch = crops.telling_patch(sequence, Source(str(path), sequence.format))
     runs = [(repeat, rung) for repeat in range(repeats) for rung in rungs]
@@ -93,9 +114,7 @@ def tradeoff(
         for name in ("twin", "fused", "fused.json", "profile.json"):
             entry = place / name
             shutil.rmtree(entry) if entry.is_dir() else entry.unlink(missing_ok=True)
-    if out.exists():
-        shutil.rmtree(out)
-    work.rename(out)
+    move_folder(work, out, lambda name: name.parts[0].partition(".")[0] in OWN)
     return rows, by_effect
 
 
@@ -103,7 +122,7 @@ def _enter(work: Path, asked: dict) -> None:
     """Make the working folder, or go on in it if it was made for the same sequence and geometry."""
     question = work / TRADEOFF
     if question.exists():
-        if json.loads(question.read_text()) != asked:
+        if json.loads(question.read_text(encoding="utf-8")) != asked:
             raise OutputError(
                 f"{work} holds the results of another sequence or geometry; delete it or choose another -o"
             )
@@ -132,6 +151,8 @@ def machine() -> str:
     model = platform.processor() or platform.machine()
     info = Path("/proc/cpuinfo")
     if info.exists():
-        lines = [line for line in info.read_text().splitlines() if line.startswith("model name")]
+        lines = [
+            line for line in info.read_text(encoding="utf-8").splitlines() if line.startswith("model name")
+        ]
         model = lines[0].split(":", 1)[1].strip() if lines else model
     return f"{os.cpu_count()} cores, {model}, {platform.system()}"

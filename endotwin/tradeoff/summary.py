@@ -25,7 +25,8 @@ def summary(
         "peak_memory_mb", "load", "stages": {name: s}, "commands": [str]}``; a score nobody measured is NaN.
     """
     runs = [
-        json.loads((work / "results" / f"{rung.name}.{repeat}.json").read_text()) for repeat in range(repeats)
+        json.loads((work / "results" / f"{rung.name}.{repeat}.json").read_text(encoding="utf-8"))
+        for repeat in range(repeats)
     ]
     values = {
         name: np.array([np.nan if run[name] is None else run[name] for run in runs], float)

@@ -1,5 +1,5 @@
 """The twin: a surface with materials, a light and a response, in memory and on disk."""
 
-from endotwin.twin.twin import Light, Materials, Response, Source, Twin
+from endotwin.twin.twin import Light, Materials, Response, Source, Twin, as_twin
 
-__all__ = ["Light", "Materials", "Response", "Source", "Twin"]
+__all__ = ["Light", "Materials", "Response", "Source", "Twin", "as_twin"]

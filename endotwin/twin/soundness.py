@@ -18,6 +18,7 @@ SURFACE = {
     "nearest_mm": (np.float32, 0),
     "filled": (np.bool_, 0),
 }
+LARGEST_MM = 1e7
 MATERIALS = {"base_color": (np.float32, 3), "roughness": (np.float32, 0), "metallic": (np.float32, 0)}
 """Type and columns of the arrays that have a row for each vertex (origin_mm: just three numbers)."""
 
@@ -34,6 +35,11 @@ def require_sound(twin: Twin) -> Twin:
     _require("triangles", bool(((triangles >= 0) & (triangles < count)).all()))
     for name in ("vertices_mm", "origin_mm", "normals"):
         _require(name, bool(np.isfinite(getattr(surface, name)).all()))
+    if not len(triangles):
+        raise ValueError("its surface is empty")
+    size_mm = float(np.ptp(surface.vertices_mm.astype(np.float64), axis=0).max())
+    if size_mm > LARGEST_MM:
+        raise ValueError(f"its surface is {size_mm:.3g} mm large")
     source = twin.source
     _require("the source", isinstance(source.path, str) and isinstance(source.format, str))
     _require("the source's scale", _positive(source.scale))

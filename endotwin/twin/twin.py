@@ -2,32 +2,40 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
+import os
+import re
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 from safetensors import SafetensorError
-from safetensors.numpy import load_file, save_file
+from safetensors.numpy import load_file, save
 
 from endotwin.cameras import Camera, camera_from_dict
 from endotwin.effects import Decision, Effects
 from endotwin.errors import SequenceError, TwinError
 from endotwin.light.shading import F0_DIELECTRIC
 from endotwin.run.jsontext import parsed
-from endotwin.run.output import TWIN, whole_folder
+from endotwin.run.output import TWIN, write_folder
 from endotwin.sequence import Sequence
 from endotwin.sequence.readers import open_sequence
 from endotwin.surface import Surface
 from endotwin.twin.soundness import require_sound
 
-VERSION = 1
-FILES = (TWIN, "surface.safetensors", "materials.safetensors", "effects.json")
+VERSION = 2
+OWN = re.compile(r"twin\.json|effects\.json|(surface|materials)(-[0-9a-f]{16})?\.safetensors")
+"""Files of a twin of any version. Arrays lie in files that are named by their own checksum; ``twin.json``
+says which of them are the twin's, so that its rename replaces all of them at once."""
+PARTS = ("camera", "source", "materials", "light", "response", "record")
+UNSEALED = ("source", "record", "seal")
+"""Parts of ``twin.json`` that its checksum leaves out: a rendering does not depend on them."""
 MAPS = ("base_color", "roughness", "metallic")
 HOLDOUT_EVERY = 8
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Materials:
     """Disney materials of every vertex.
 
@@ -48,6 +56,11 @@ class Materials:
     def per_vertex(self) -> dict[str, np.ndarray]:
         """The maps by name."""
         return {name: getattr(self, name) for name in MAPS}
+
+    @property
+    def constants(self) -> dict[str, float | str]:
+        """What is one for the whole surface, by name."""
+        return {"f0": self.f0, "diffuse": self.diffuse}
 
 
 @dataclass(frozen=True)
@@ -102,7 +115,7 @@ class Source:
         return [training[i] for i in np.linspace(0, len(training) - 1, self.frames).round().astype(int)]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Twin:
     """A surface and, once fitted, its materials, light and response.
 
@@ -176,26 +189,37 @@ class Twin:
         Raises:
             OutputError: ``path`` exists and ``overwrite`` is false, or it is something else than a twin.
         """
-        with whole_folder(path, FILES, overwrite) as folder:
-            self.surface.save(folder / "surface.safetensors")
-            if self.fitted:
-                save_file(self.materials.per_vertex, folder / "materials.safetensors")
-            document = {
-                "version": VERSION,
-                "camera": self.camera.to_dict(),
-                "source": asdict(self.source),
-                "materials": {"f0": self.materials.f0, "diffuse": self.materials.diffuse}
-                if self.fitted
-                else None,
-                "light": asdict(self.light) if self.light else None,
-                "response": asdict(self.response) if self.response else None,
-                "effects": self.effects.to_dict(),
-                "record": self.record,
-            }
-            if self.decisions:
-                decisions = {name: asdict(decision) for name, decision in self.decisions.items()}
-                (folder / "effects.json").write_text(json.dumps({"effects": decisions}, indent=1) + "\n")
-            (folder / "twin.json").write_text(json.dumps(document, indent=1) + "\n")
+        arrays = self._arrays()
+        document = self._document(arrays)
+        contents = {document["files"][part]: content for part, content in arrays.items()}
+        contents[TWIN] = (json.dumps(document, indent=1) + "\n").encode()
+        write_folder(path, contents, TWIN, OWN, overwrite)
+
+    @property
+    def seal(self) -> str:
+        """SHA-256 of all that a rendering depends on: equal for the same twin, whatever its record."""
+        return self._document(self._arrays())["seal"]
+
+    def _arrays(self) -> dict[str, bytes]:
+        """Contents of the files of arrays, by part."""
+        fitted = {"materials": save(self.materials.per_vertex)} if self.fitted else {}
+        return {"surface": self.surface.to_bytes(), **fitted}
+
+    def _document(self, arrays: dict[str, bytes]) -> dict:
+        """Content of ``twin.json`` beside files of ``arrays``."""
+        document = {
+            "version": VERSION,
+            "files": {part: f"{part}-{_checksum(content)}.safetensors" for part, content in arrays.items()},
+            "camera": self.camera.to_dict(),
+            "source": asdict(self.source),
+            "materials": self.materials.constants if self.fitted else None,
+            "light": asdict(self.light) if self.light else None,
+            "response": asdict(self.response) if self.response else None,
+            "effects": self.effects.to_dict(),
+            "decisions": {name: asdict(decision) for name, decision in self.decisions.items()},
+            "record": self.record,
+        }
+        return {**document, "seal": _seal(document)}
 
     @classmethod
     def load(cls, path: Path) -> Twin:
@@ -207,37 +231,83 @@ class Twin:
         path = Path(path)
         document = _read_document(path)
         try:
+            _check_document(document)
+            files = _checked_files(path, document)
             constants = document["materials"]
             twin = cls(
-                surface=Surface.load(path / "surface.safetensors"),
-                camera=camera_from_dict(document["camera"], path / "twin.json"),
+                surface=Surface.load(files["surface"]),
+                camera=camera_from_dict(document["camera"], path / TWIN),
                 source=Source(**document["source"]),
-                materials=Materials(**load_file(path / "materials.safetensors"), **constants)
-                if constants
-                else None,
+                materials=Materials(**load_file(files["materials"]), **constants) if constants else None,
                 light=Light(**document["light"]) if document["light"] else None,
                 response=Response(**document["response"]) if document["response"] else None,
                 record=document["record"],
                 effects=Effects.from_dict(document.get("effects", {})),
-                decisions=_read_decisions(path / "effects.json"),
+                decisions=_read_decisions(path, document),
             )
             return require_sound(twin)
+        except FileNotFoundError as error:
+            if _read_document(path) != document:  # another run replaced the twin just now
+                return cls.load(path)
+            raise TwinError(
+                f"{path} is a damaged twin ({error.filename} is gone); make it again with 'endotwin fuse'"
+            ) from error
         except (OSError, KeyError, TypeError, ValueError, AttributeError, SafetensorError) as error:
             raise TwinError(
                 f"{path} is a damaged twin ({error}); make it again with 'endotwin fuse'"
             ) from error
 
 
-def _read_decisions(path: Path) -> dict[str, Decision]:
-    if not path.exists():
-        return {}
-    document = parsed(path.read_text(encoding="utf-8"))
-    return {name: Decision(**values) for name, values in document["effects"].items()}
+def as_twin(given: Twin | Path | str) -> Twin:
+    """``given`` itself, or the twin in the folder that it names. Raises TwinError where it is neither."""
+    if isinstance(given, Twin):
+        return given
+    if isinstance(given, str | os.PathLike):
+        return Twin.load(Path(given))
+    raise TwinError(f"{type(given).__name__} is no twin; give what fuse_twin or fit_twin made, or its folder")
+
+
+def _checksum(content: bytes) -> str:
+    """The first 64 bits of the SHA-256, in the 16 digits that names of files have."""
+    return hashlib.sha256(content).hexdigest()[:16]
+
+
+def _seal(document: dict) -> str:
+    """SHA-256 of all in ``twin.json`` that a rendering depends on."""
+    sealed = {part: value for part, value in document.items() if part not in UNSEALED}
+    return hashlib.sha256(json.dumps(sealed, sort_keys=True).encode()).hexdigest()
+
+
+def _check_document(document: dict) -> None:
+    """Raise KeyError where a part is missing, and ValueError where they do not match their checksum."""
+    for part in PARTS:
+        document[part]
+    if document["version"] > 1 and document["seal"] != _seal(document):
+        raise ValueError(f"{TWIN} does not match its checksum")
+
+
+def _checked_files(path: Path, document: dict) -> dict[str, Path]:
+    """The twin's array files by part. Raises ValueError where one does not match its checksum."""
+    if document["version"] == 1:
+        return {part: path / f"{part}.safetensors" for part in ("surface", "materials")}
+    files = {}
+    for part, name in document["files"].items():
+        if name != f"{part}-{_checksum((path / name).read_bytes())}.safetensors":
+            raise ValueError(f"{name} does not match its checksum")
+        files[part] = path / name
+    return files
+
+
+def _read_decisions(path: Path, document: dict) -> dict[str, Decision]:
+    decisions = document.get("decisions", {})
+    if document["version"] == 1 and (path / "effects.json").exists():
+        decisions = parsed((path / "effects.json").read_text(encoding="utf-8"))["effects"]
+    return {name: Decision(**values) for name, values in decisions.items()}
 
 
 def _read_document(path: Path) -> dict:
     try:
-        document = parsed((path / "twin.json").read_text(encoding="utf-8"))
+        document = parsed((path / TWIN).read_text(encoding="utf-8"))
         version = document["version"]
     except NotADirectoryError:
         raise TwinError(f"{path} is a file; give the folder of the twin") from None

@@ -17,6 +17,8 @@ from endotwin.pixels.pace import Pace
 from endotwin.pixels.samples import gather
 from endotwin.surface.casting import Caster
 
+pytestmark = pytest.mark.slow
+
 EXAMPLE = Path(__file__).parents[2] / "examples" / "colon_small"
 DATA = Path(os.environ.get("ENDOTWIN_DATA", "nowhere"))
 needs_data = pytest.mark.skipif(not DATA.is_dir(), reason="ENDOTWIN_DATA names no folder")

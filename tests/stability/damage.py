@@ -1,10 +1,14 @@
 """Small sequences in every layout, and ways to damage one of their files."""
 
+import codecs
 import json
+import struct
+import zlib
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+import OpenEXR
 import tifffile
 from hypothesis import strategies as st
 from PIL import Image
@@ -97,6 +101,35 @@ def write_transforms_npy(folder: Path) -> Path:
     return folder
 
 
+def write_transforms_masked(folder: Path) -> Path:
+    write_transforms(folder)
+    content = json.loads((folder / "transforms.json").read_text())
+    (folder / "masks").mkdir()
+    for index, frame in enumerate(content["frames"]):
+        Image.fromarray(np.full((HEIGHT, WIDTH), 255, np.uint8)).save(folder / f"masks/{index}.png")
+        frame["mask_path"] = f"masks/{index}.png"
+    (folder / "transforms.json").write_text(json.dumps(content))
+    return folder
+
+
+def write_c3vd_exr(folder: Path) -> Path:
+    write_c3vd(folder)
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    for index in range(FRAMES):
+        (folder / f"{index:04d}_depth.tiff").unlink()
+        depth_mm = np.full((HEIGHT, WIDTH), 14.0, np.float32)
+        OpenEXR.File(header, {"Z": depth_mm}).write(str(folder / f"{index:04d}_depth.exr"))
+    return folder
+
+
+def write_c3vd_v2_npz(folder: Path) -> Path:
+    write_c3vd_v2(folder)
+    for index in range(FRAMES):
+        (folder / f"depth/{index:04d}.tiff").unlink()
+        np.savez(folder / f"depth/{index:04d}.npz", depth=np.full((HEIGHT, WIDTH), 14.0))
+    return folder
+
+
 def write_simcol(folder: Path) -> Path:
     size = (SIMCOL_SIZE, SIMCOL_SIZE)
     _photo(folder / "FrameBuffer_0000.png", 0, size)
@@ -123,7 +156,17 @@ def write_tum(folder: Path) -> Path:
 
 WRITERS: dict[str, Callable[[Path], Path]] = {
     writer.__name__.removeprefix("write_"): writer
-    for writer in (write_c3vd, write_c3vd_v2, write_transforms, write_transforms_npy, write_simcol, write_tum)
+    for writer in (
+        write_c3vd,
+        write_c3vd_exr,
+        write_c3vd_v2,
+        write_c3vd_v2_npz,
+        write_transforms,
+        write_transforms_masked,
+        write_transforms_npy,
+        write_simcol,
+        write_tum,
+    )
 }
 
 
@@ -141,11 +184,16 @@ def files_of(folder: Path) -> Files:
 
 @st.composite
 def damaged(draw: st.DrawFn, contents: dict[Path, bytes]) -> tuple[Path, bytes]:
-    """One of the files and its damaged bytes: cut short, bits flipped, another file's, or odd values."""
+    """One of the files and its damaged bytes: cut short, bits flipped, another file's, odd values, a mark at
+    its head, nested without end, or claiming to be huge."""
     path = draw(st.sampled_from(sorted(contents)))
     content = contents[path]
     kinds = ["cut", "flip", "swap", "noise"]
-    kinds += {".txt": ["number"] * 4, ".json": ["value"] * 6}.get(path.suffix, [])
+    kinds += {
+        ".txt": ["number"] * 4 + ["mark"],
+        ".json": ["value"] * 6 + ["mark", "deep"],
+        ".png": ["huge"],
+    }.get(path.suffix, [])
     kind = draw(st.sampled_from(kinds))
     if kind == "cut":
         return path, content[: draw(st.integers(0, max(0, len(content) - 1)))]
@@ -158,11 +206,23 @@ def damaged(draw: st.DrawFn, contents: dict[Path, bytes]) -> tuple[Path, bytes]:
         return path, contents[draw(st.sampled_from(sorted(contents)))]
     if kind == "noise":
         return path, draw(st.binary(max_size=64))
+    if kind == "mark":
+        return path, codecs.BOM_UTF8 + content
+    if kind == "deep":
+        return path, draw(st.sampled_from([b"[", b'{"a":'])) * 20_000
+    if kind == "huge":
+        return path, _claiming(content, draw(st.sampled_from([0, 60_000, 2**31 - 1])))
     if kind == "number":
         words = content.decode().replace(",", " , ").split(" ")
         words[draw(st.integers(0, len(words) - 1))] = draw(st.sampled_from(ODD_NUMBERS))
         return path, " ".join(words).encode()
     return path, _with_odd_value(draw, json.loads(content))
+
+
+def _claiming(png: bytes, size: int) -> bytes:
+    """The PNG file with a header that says it is ``size`` pixels wide and high."""
+    header = b"IHDR" + struct.pack(">II", size, size) + png[24:29]
+    return png[:12] + header + struct.pack(">I", zlib.crc32(header)) + png[33:]
 
 
 def _with_odd_value(draw: st.DrawFn, document: object) -> bytes:

@@ -1,5 +1,6 @@
 """Damaged files: every reader and every command answers with one sentence, never with a traceback."""
 
+import json
 import shutil
 import warnings
 from pathlib import Path
@@ -7,16 +8,35 @@ from pathlib import Path
 import numpy as np
 import pytest
 import tube_sequence
+import tube_twin
 from command_line import invoke
 from damage import WRITERS, Files, damaged, files_of
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import endotwin
-from endotwin.errors import EndotwinError
+from endotwin.config import load_config
+from endotwin.errors import EndotwinError, OptionError, TwinError
+from endotwin.synth import Variation, read_variation
+
+pytestmark = pytest.mark.slow
 
 FEW = settings(max_examples=60, deadline=None, suppress_health_check=list(HealthCheck), derandomize=True)
 FEWER = settings(FEW, max_examples=10)
+WORDS = [
+    "per",
+    "clip",
+    "material",
+    "light",
+    "response",
+    "regions",
+    "effects",
+    "parameters",
+    "fuse",
+    "fit",
+    "box",
+]
+WORDS += ["name", "vertices", "scale", "voxel", "frames", "method", "budget", "noise", "gain"]
 
 
 @pytest.fixture(scope="module", params=sorted(WRITERS))
@@ -83,13 +103,72 @@ def test_fuse_of_a_damaged_sequence_is_a_twin_or_one_sentence(made, data):
     spoil_and_run(files_of(made / "tube"), data, out, "fuse", made / "tube", "-o", out)
 
 
-@settings(FEW, max_examples=20)
-@given(data=st.data(), command=st.sampled_from(["fit", "synth", "eval"]))
+@settings(FEW, max_examples=30)
+@given(data=st.data(), command=st.sampled_from(["fit", "synth", "eval", "inspect", "synth to a file"]))
 def test_commands_on_a_damaged_twin_or_its_sequence_are_done_or_one_sentence(made, data, command):
-    out = made / ("out.png" if command == "eval" else "out")
+    out = made / ("out.png" if command in ("eval", "inspect") else "out")
     arguments = {
         "fit": ("fit", made / "twin", "-o", out, "--budget", 2),
         "synth": ("synth", made / "twin", "--trajectory", "jitter:frames=2", "-o", out),
+        "synth to a file": ("synth", made / "twin", "--trajectory", made / "tube/pose.txt", "-o", out),
         "eval": ("eval", made / "twin", "--sheet", out),
+        "inspect": ("inspect", made / "twin", "--screenshot", out, "--map", "coverage"),
     }[command]
     spoil_and_run(Files({**files_of(made / "twin"), **files_of(made / "tube")}), data, out, *arguments)
+
+
+@FEWER
+@given(data=st.data())
+def test_check_of_a_damaged_sequence_names_a_finding_or_says_one_sentence(made, data):
+    contents = files_of(made / "tube")
+    path, spoilt = data.draw(damaged(contents))
+    path.write_bytes(spoilt)
+    try:
+        assert invoke("check", made / "tube", "--json") in (0, 1, 2)
+    finally:
+        path.write_bytes(contents[path])
+
+
+@FEW
+@given(data=st.data())
+def test_a_flipped_bit_in_a_twin_is_told_wherever_a_rendering_depends_on_it(made, data):
+    whole = endotwin.Twin.load(made / "twin")
+    contents = files_of(made / "twin")
+    path = data.draw(st.sampled_from(sorted(contents)))
+    spoilt = bytearray(contents[path])
+    spoilt[data.draw(st.integers(0, len(spoilt) - 1))] ^= 1 << data.draw(st.integers(0, 7))
+    path.write_bytes(spoilt)
+    try:
+        loaded = endotwin.Twin.load(made / "twin")
+    except TwinError as error:
+        assert str(error) and "\n" not in str(error)
+    else:
+        assert path.name == "twin.json" and loaded.seal == whole.seal
+    finally:
+        path.write_bytes(contents[path])
+
+
+TWIN = tube_twin.fitted(tube_twin.surface())
+YAML = st.one_of(
+    st.text(max_size=40),
+    st.sampled_from(["[", "{a: ", "- ", "? "]).map(lambda opening: opening * 20_000),
+    st.recursive(
+        st.one_of(st.none(), st.booleans(), st.floats(), st.integers(), st.text(max_size=8)),
+        lambda inner: (
+            st.lists(inner, max_size=3) | st.dictionaries(st.sampled_from(WORDS), inner, max_size=3)
+        ),
+        max_leaves=8,
+    ).map(lambda value: json.dumps(value, ensure_ascii=False)),
+)
+
+
+@settings(FEW, max_examples=100)
+@given(text=YAML, marked=st.booleans())
+def test_any_text_is_a_config_or_ranges_or_one_sentence(made, text, marked):
+    file = made / "any.yaml"
+    file.write_text(text, encoding="utf-8-sig" if marked else "utf-8", errors="replace")
+    for read in (load_config, lambda path: read_variation(path, TWIN, Variation())):
+        try:
+            read(file)
+        except OptionError as error:
+            assert str(error) and "\n" not in str(error)

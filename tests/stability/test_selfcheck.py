@@ -11,9 +11,12 @@ from endotwin.cli.main import app
 from endotwin import selfcheck
 from endotwin.selfcheck import GROUPS, Finding, run_checks
 
+pytestmark = pytest.mark.slow
+
 CHECKS = [(name, check) for name in GROUPS for check in import_module(f"endotwin.selfcheck.{name}").CHECKS]
 
 
+@pytest.mark.filterwarnings("error::RuntimeWarning")  # as the command has it
 @pytest.mark.parametrize(
     "check", [check for _, check in CHECKS], ids=[f"{n}-{c.__name__}" for n, c in CHECKS]
 )

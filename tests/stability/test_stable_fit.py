@@ -22,6 +22,8 @@ from endotwin.selfcheck.journey import travel, warnings_said
 from endotwin.selfcheck.tube import Tube, flight
 from endotwin.twin import Light, Response, Twin
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def tube(tmp_path_factory) -> Twin:

@@ -9,6 +9,8 @@ from endotwin.fusion.views import read_views
 from endotwin.selfcheck.journey import warnings_said
 from endotwin.selfcheck.tube import Tube, flight
 
+pytestmark = pytest.mark.slow
+
 VOXEL_MM = 0.5
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
@@ -13,6 +14,9 @@ from endotwin.sequence.sequence import Sequence
 __all__ = ["FORMATS", "open_sequence"]
 
 FORMATS: dict[str, ModuleType] = {"c3vd": c3vd, "transforms": transforms, "simcol": simcol, "tum": tum}
+
+LEAST_PX = 8
+"""Height and width below which an image that was made smaller shows nothing."""
 
 
 def open_sequence(path: Path | str, format: str | None = None, scale: float = 1.0) -> Sequence:
@@ -28,6 +32,8 @@ def open_sequence(path: Path | str, format: str | None = None, scale: float = 1.
         CameraError: the camera is unknown or impossible.
         OptionError: there is no such format or scale.
     """
+    if not isinstance(path, str | os.PathLike):
+        raise OptionError(f"a sequence is given by its folder, and not as {type(path).__name__}")
     path = Path(path)
     if format is not None and format not in FORMATS:
         raise OptionError(f"There is no format {format!r}; choose one of {', '.join(FORMATS)}")
@@ -40,13 +46,18 @@ def open_sequence(path: Path | str, format: str | None = None, scale: float = 1.
         raise SequenceError(f"{path} is a file; name the folder that holds the sequence")
     if not reader.detects(path):
         raise SequenceError(
-            f"{path} is not in the layout {format}, as it has no {reader.MARK}; leave out --format"
+            f"{path} is not in the layout {format}, as it has no {reader.MARK}; name no format"
         )
     sequence = reader.read(path)
     sequence.check()
     if scale == 1:
         return sequence
-    return replace(sequence, camera=sequence.camera.scaled(scale), scale=scale)
+    camera = sequence.camera.scaled(scale)
+    if min(camera.width, camera.height) < LEAST_PX:
+        raise OptionError(
+            f"A scale of {scale:g} leaves {camera.width}×{camera.height} pixels, too few; choose 0.5, say"
+        )
+    return replace(sequence, camera=camera, scale=scale)
 
 
 def _detected(path: Path) -> ModuleType:
@@ -61,5 +72,5 @@ def _detected(path: Path) -> ModuleType:
             raise SequenceError(f"{path} has no frames itself, but {folder.name} in it has; name {folder}")
     marks = ", ".join(f"{name} ({reader.MARK})" for name, reader in FORMATS.items())
     raise SequenceError(
-        f"{path} has no frames in a known layout, which are {marks}; check it or give --format"
+        f"{path} has no frames in a known layout, which are {marks}; check it or name its format"
     )

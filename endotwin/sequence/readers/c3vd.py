@@ -2,7 +2,8 @@
 
 v1: ``N_color.png``, ``NNNN_depth.tiff`` and ``pose.txt`` in one folder.
 v2: ``rgb/NNNN.png``, ``depth/NNNN.tiff`` and ``pose.txt``.
-Depth is 16 bit, 65535 = 100 mm; 0 is none and 65535 clipped, so neither is valid. A ``camera.json`` in the
+Depth is 16 bit, 65535 = 100 mm; 0 is none and 65535 clipped, so neither is valid. Floating-point depth (TIFF,
+or NPY, NPZ or OpenEXR of the same name) is in mm. A ``camera.json`` in the
 folder overrides C3VD's own calibration.
 """
 
@@ -14,6 +15,7 @@ import numpy as np
 
 from endotwin.cameras import CALIBRATIONS, read_camera
 from endotwin.errors import SequenceError
+from endotwin.sequence.floatdepth import in_mm
 from endotwin.sequence.images import read_plane
 from endotwin.sequence.poses import FRAMES_PER_SECOND, read_c3vd_poses
 from endotwin.sequence.readers.numbered import numbered_files, paired
@@ -22,6 +24,7 @@ from endotwin.sequence.sequence import Sequence
 MARK = "pose.txt"
 DEPTH_RANGE_MM = 100.0
 COLOR_V1, DEPTH_V1 = r"(\d+)_color\.(?:png|jpe?g|tiff?)", r"(\d+)_depth\.(?:tiff?|png)"
+FLOAT_V1, FLOAT_V2 = r"(\d+)_depth(?:_exr)?\.(?:exr|np[yz])", r"(\d+)(?:_depth)?\.(?:exr|np[yz])"
 COLOR_V2, DEPTH_V2 = r"(\d+)(?:_color)?\.(?:png|jpe?g|tiff?)", r"(\d+)(?:_depth)?\.(?:tiff?|png)"
 
 
@@ -36,10 +39,10 @@ def read(path: Path) -> Sequence:
     """The sequence in a folder of either version, at its native size."""
     if (path / "rgb").is_dir():
         version, color = "c3vd-v2", numbered_files(path / "rgb", COLOR_V2)
-        depth = numbered_files(path / "depth", DEPTH_V2) if (path / "depth").is_dir() else {}
+        depth = _depth_files(path)
     else:
         version, color = "c3vd-v1", numbered_files(path, COLOR_V1)
-        depth = numbered_files(path, DEPTH_V1)
+        depth = numbered_files(path, DEPTH_V1) or numbered_files(path, FLOAT_V1)
     color_files, depth_files = paired(color, depth, path)
     T_world_camera = read_c3vd_poses(path / "pose.txt")
     if len(T_world_camera) > len(color):
@@ -57,6 +60,14 @@ def read(path: Path) -> Sequence:
     )
 
 
+def _depth_files(path: Path) -> dict[int, Path]:
+    """Depth maps of version 2 by number; those that are coded, as C3VD's are, before floating-point ones."""
+    for name, pattern in (("depth", DEPTH_V2), ("depth", FLOAT_V2), ("depth_exr", FLOAT_V2)):
+        if (path / name).is_dir() and (found := numbered_files(path / name, pattern)):
+            return found
+    return {}
+
+
 def _check_complete(numbers: list[int], poses: int, path: Path) -> None:
     """Raise SequenceError that names the first number that the frames leave out, if they leave one out."""
     absent = next((n for n in range(numbers[0], numbers[-1]) if n not in numbers), None)
@@ -68,11 +79,14 @@ def _check_complete(numbers: list[int], poses: int, path: Path) -> None:
 
 
 def read_depth_mm(path: Path) -> np.ndarray:
-    """A C3VD depth map, float32 [H, W] in mm, NaN where raw 0 or 65535."""
+    """A C3VD depth map, float32 [H, W] in mm, NaN where raw 0 or 65535; or one of floating-point mm."""
     raw = read_plane(path)
+    if raw.dtype.kind == "f":
+        return in_mm(raw, 1.0)
     if raw.dtype != np.uint16:
         raise SequenceError(
-            f"{path} holds {raw.dtype}, not the 16 bit of C3VD's depth; write 65535 for 100 mm"
+            f"{path} holds {raw.dtype}, not the 16 bit of C3VD's depth; write 65535 for 100 mm, or floats "
+            "in mm"
         )
     depth_mm = raw.astype(np.float32) * np.float32(DEPTH_RANGE_MM / 65535)
     depth_mm[(raw == 0) | (raw == 65535)] = np.nan

@@ -71,7 +71,7 @@ def _camera(path: Path) -> Camera:
     file = next((place / "cam.txt" for place in (path, path.parent) if (place / "cam.txt").is_file()), None)
     if file is None:
         return Pinhole(SIZE, SIZE, fx=227.60416, fy=227.60416, cx=SIZE / 2 - 0.5, cy=SIZE / 2 - 0.5)
-    words = re.split(r"[,\s]+", file.read_text(encoding="utf-8", errors="replace").strip())
+    words = re.split(r"[,\s]+", file.read_text(encoding="utf-8-sig", errors="replace").strip())
     try:
         K = np.array(words, np.float64).reshape(3, 3)
     except ValueError as error:

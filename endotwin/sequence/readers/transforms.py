@@ -3,13 +3,15 @@
 Unit: positions are metres, as nerfstudio has it, unless the file says ``"unit": "mm"``; depth in that
 unit is the stored value times ``depth_unit_scale_factor`` (0.001 unless given: 16-bit millimetres beside
 positions in metres), or times instant-ngp's ``integer_depth_scale``. Depth is z-depth, 0 for none; PNG,
-TIFF and NPY are read. A frame's depth map is its ``depth_file_path`` (instant-ngp: ``depth_path``), or
-else ``depth/NAME.*`` beside the photo's folder, or ``NAME_depth.*`` beside the photo. Principal points
-count from the image's edge, so half a pixel is subtracted.
+TIFF, NPY, NPZ and OpenEXR are read. A frame's depth map is its ``depth_file_path`` (instant-ngp:
+``depth_path``), or else ``depth/NAME.*`` beside the photo's folder, or ``NAME_depth.*`` beside the photo.
+Where a frame's ``mask_path`` is 0, there is no depth. Principal points count from the image's edge, so half
+a pixel is subtracted.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from functools import partial
 from math import isfinite, tan
 from pathlib import Path
@@ -18,13 +20,14 @@ import numpy as np
 
 from endotwin.cameras import Camera, camera_from_dict
 from endotwin.errors import CameraError, SequenceError
+from endotwin.sequence.floatdepth import SUFFIXES, in_mm
 from endotwin.sequence.images import read_color, read_plane
 from endotwin.sequence.poses import frame_times, read_json, read_transforms_poses, transforms_unit_mm
 from endotwin.sequence.sequence import Sequence
 
 MARK = "transforms.json"
 COLOR_SUFFIXES = (".png", ".jpg", ".jpeg", ".tiff", ".tif")
-DEPTH_SUFFIXES = (".png", ".tiff", ".tif", ".npy")
+DEPTH_SUFFIXES = (".png", ".tiff", ".tif", *SUFFIXES)
 PINHOLES = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV")
 FISHEYE = "OPENCV_FISHEYE"
 INTRINSICS = (
@@ -65,18 +68,23 @@ def read(path: Path) -> Sequence:
         T_world_camera=T_world_camera,
         color_files=color_files,
         depth_files=depth_files,
-        read_depth_mm=partial(read_depth_mm, level_mm=level_mm),
+        read_depth_mm=partial(read_depth_mm, level_mm=level_mm, masks=_masks(file, frames, depth_files)),
         timestamps_s=frame_times(len(frames)),
     )
 
 
-def read_depth_mm(path: Path, level_mm: float) -> np.ndarray:
-    """A depth map of any numeric type, float32 [H, W] in mm, ``level_mm`` a level, NaN where not positive."""
+def read_depth_mm(path: Path, level_mm: float, masks: Mapping[Path, Path] | None = None) -> np.ndarray:
+    """A depth map of any numeric type, float32 [H, W] in mm, ``level_mm`` a level; NaN where it is not
+    positive, and where the mask that goes with it is 0."""
     raw = read_plane(path)
     if raw.dtype == np.uint8:
         raise SequenceError(f"{path} holds 8 bit, too coarse for depth; write 16-bit PNG or floating point")
-    depth_mm = raw.astype(np.float32) * np.float32(level_mm)
-    depth_mm[~(np.isfinite(depth_mm) & (depth_mm > 0))] = np.nan
+    depth_mm = in_mm(raw, level_mm)
+    if masks and path in masks:
+        mask = read_plane(masks[path])
+        if mask.shape != depth_mm.shape:
+            raise SequenceError(f"{masks[path]} is not of the size of {path.name}; give them the same size")
+        depth_mm[mask == 0] = np.nan
     return depth_mm
 
 
@@ -118,6 +126,19 @@ def _depth_file(file: Path, frame: dict, photo: Path) -> Path:
             f"{photo} has no depth map; add depth/{photo.stem}.png or 'depth_file_path' to {file}"
         )
     return found
+
+
+def _masks(file: Path, frames: list[dict], depth_files: tuple[Path, ...]) -> dict[Path, Path]:
+    """Masks that frames name, by the depth map that each limits; nerfstudio leaves out pixels that are 0."""
+    masks = {}
+    for frame, depth in zip(frames, depth_files, strict=True):
+        if named := frame.get("mask_path"):
+            masks[depth] = file.parent / str(named)
+            if not masks[depth].is_file():
+                raise SequenceError(
+                    f"{masks[depth]}, named in {file.name}, does not exist; add the mask or remove its name"
+                )
+    return masks
 
 
 def _depth_scale(file: Path, content: dict) -> float:

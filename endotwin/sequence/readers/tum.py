@@ -1,8 +1,8 @@
 """TUM RGB-D (Sturm et al., IROS 2012): ``rgb.txt``, ``depth.txt``, ``groundtruth.txt`` and what they list.
 
 Each photo is paired with the depth map and the pose nearest in time, within 0.02 s, and left out where
-one is missing. Depth is 16 bit, 5000 a metre, 0 for none. The format has no intrinsics, so that the
-folder needs a ``camera.json``, or a ``calibration.txt`` of 'fx fy cx cy'.
+one is missing. Depth is 16 bit, 5000 a metre, 0 for none, or floating point in metres. The format has no
+intrinsics, so that the folder needs a ``camera.json``, or a ``calibration.txt`` of 'fx fy cx cy'.
 """
 
 from __future__ import annotations
@@ -14,8 +14,9 @@ import numpy as np
 
 from endotwin.cameras import Camera, camera_from_dict, read_camera
 from endotwin.errors import CameraError, SequenceError
+from endotwin.sequence.floatdepth import in_mm
 from endotwin.sequence.images import read_color, read_plane
-from endotwin.sequence.poses import numeric_rows, read_text, read_tum_poses
+from endotwin.sequence.poses import MM_PER_UNIT, numeric_rows, read_text, read_tum_poses
 from endotwin.sequence.sequence import Sequence
 
 MARK = "rgb.txt and depth.txt"
@@ -62,11 +63,14 @@ def read(path: Path) -> Sequence:
 
 
 def read_depth_mm(path: Path) -> np.ndarray:
-    """A TUM depth map, float32 [H, W] in mm, NaN where raw 0."""
+    """A TUM depth map, float32 [H, W] in mm, NaN where raw 0; or one of floating-point metres."""
     raw = read_plane(path)
+    if raw.dtype.kind == "f":
+        return in_mm(raw, MM_PER_UNIT["m"])
     if raw.dtype != np.uint16:
         raise SequenceError(
-            f"{path} holds {raw.dtype}, not the 16 bit of TUM's depth; write 5000 for a metre"
+            f"{path} holds {raw.dtype}, not the 16 bit of TUM's depth; write 5000 for a metre, or floats in "
+            "metres"
         )
     depth_mm = raw.astype(np.float32) * np.float32(MM_PER_LEVEL)
     depth_mm[raw == 0] = np.nan

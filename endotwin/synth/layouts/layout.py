@@ -32,6 +32,7 @@ class Layout:
         refusal: why a camera or a choice of labels does not fit, as a sentence; empty where it does.
         packed: whether a shard is one tar file.
         reads: whether endotwin reads it back. root: the folder within the dataset that it reads.
+        advice: what another program must be told to read it.
     """
 
     name: str
@@ -44,6 +45,7 @@ class Layout:
     shard_frames: int = FOLDER_SHARD
     reads: bool = True
     root: str = "."
+    advice: str = ""
 
     def encoding(self, image: str) -> Encoding:
         """How ``image`` is written."""
@@ -59,7 +61,7 @@ def needs(*required: str) -> Callable[[Camera, tuple[str, ...]], str]:
 
     def refusal(camera: Camera, labels: tuple[str, ...]) -> str:
         missing = [label for label in required if label not in labels]
-        return f"this layout needs {' and '.join(missing)}; add it to --labels" if missing else ""
+        return f"this layout needs {' and '.join(missing)}; add it to the labels" if missing else ""
 
     return refusal
 
@@ -71,7 +73,7 @@ def frame_name(job: Job, index: int) -> str:
 
 def write_camera(folder: Path, camera: Camera) -> None:
     """``camera.json``."""
-    (folder / "camera.json").write_text(json.dumps(camera.to_dict(), indent=1) + "\n")
+    (folder / "camera.json").write_text(json.dumps(camera.to_dict(), indent=1) + "\n", encoding="utf-8")
 
 
 def write_lines(path: Path, lines: list[str]) -> None:

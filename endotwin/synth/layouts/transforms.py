@@ -27,8 +27,7 @@ def _refusal(camera: Camera, labels: tuple[str, ...]) -> str:
         return needs("rgb")(camera, labels)
     return (
         f"a transforms.json cannot describe this {camera.model} camera; choose another layout, or render "
-        f"through "
-        "a pinhole or fisheye one with --camera"
+        "through a pinhole or fisheye one"
     )
 
 
@@ -43,8 +42,9 @@ def _tables(folder: Path, job: Job) -> None:
     for index, pose in enumerate(job.trajectory.T_world_camera @ AXES_OPENGL_OPENCV):
         pose[:3, 3] /= MM_PER_UNIT["m"]
         frame = {"file_path": LAYOUT.file(job, index, "rgb")}
-        if "depth" in job.images:
-            frame["depth_file_path"] = LAYOUT.file(job, index, "depth")
+        for image, key in (("depth", "depth_file_path"), ("mask", "mask_path")):
+            if image in job.images:
+                frame[key] = LAYOUT.file(job, index, image)
         frames.append({**frame, "transform_matrix": pose.tolist()})
     content = {
         "camera_model": "OPENCV" if isinstance(camera, Pinhole) else "OPENCV_FISHEYE",
@@ -59,7 +59,7 @@ def _tables(folder: Path, job: Job) -> None:
         "integer_depth_scale": DEPTH_SCALE,
         "frames": frames,
     }
-    (folder / "transforms.json").write_text(json.dumps(content, indent=1) + "\n")
+    (folder / "transforms.json").write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
 
 
 LAYOUT = Layout(
@@ -70,9 +70,11 @@ LAYOUT = Layout(
         "poses": "transforms.json: camera-to-world matrices, positions in metres, camera axes x right, y "
         "up, z "
         "backward (OpenGL); nerfstudio needs --depth-unit-scale-factor 2e-6, instant-ngp reads "
-        "integer_depth_scale; principal point counted from the image's edge",
+        "integer_depth_scale; mask_path: pixels that are 0 are left out; principal point counted from the "
+        "image's edge",
         "camera": "transforms.json: OPENCV or OPENCV_FISHEYE intrinsics in pixels",
     },
     {"depth": depth_png(LEVELS_PER_MM, f"16-bit z-depth, raw / {LEVELS_PER_MM} mm; 0: none")},
     _refusal,
+    advice=f"nerfstudio needs --depth-unit-scale-factor {DEPTH_SCALE:g}",
 )

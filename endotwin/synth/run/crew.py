@@ -2,22 +2,20 @@
 
 from __future__ import annotations
 
-import multiprocessing
-import os
+import logging
 import pickle
-import signal
 from collections.abc import Iterable, Iterator
-from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
-from concurrent.futures.process import BrokenProcessPool
+from concurrent.futures import FIRST_COMPLETED, CancelledError, wait
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
-from threading import Lock, Thread
+from threading import Lock
 
 import torch
 from threadpoolctl import threadpool_limits
 
 from endotwin.errors import OptionError, OutputError
+from endotwin.run.processes import Pool
 from endotwin.synth.job import Job
 from endotwin.synth.labels import Labeller
 from endotwin.synth.run.shard import DONE, render_shard
@@ -35,31 +33,16 @@ def render_here(job: Job, folder: Path, shards: Iterable[int]) -> Iterator[int]:
 
 
 def render_in_processes(job: Job, folder: Path, shards: Iterable[int], workers: int) -> Iterator[int]:
-    """Render in so many processes, each of which reads the job once; the shards' numbers as they come.
-
-    The processes are spawned, so a script that calls this needs ``if __name__ == "__main__":``. They end with
-    this process, even where it is killed.
-    """
-    context = multiprocessing.get_context("spawn")
-    stop = context.Event()
+    """Render in so many processes, each of which reads the job once; the shards' numbers as they come."""
     sent = folder / DONE / "job.pickle"
     with sent.open("wb") as file:
         pickle.dump(job, file, pickle.HIGHEST_PROTOCOL)
-    with ProcessPoolExecutor(workers, context, _enlist, (sent, folder, stop)) as pool:
-        try:
-            tasks = {pool.submit(_work, number): number for number in shards}
-            while tasks:
-                for task in wait(tasks, return_when=FIRST_COMPLETED).done:
-                    task.result()
-                    yield tasks.pop(task)
-        except BrokenProcessPool as error:
-            raise OutputError(
-                "a worker process died, perhaps for want of memory; the same command goes on with fewer "
-                "--workers"
-            ) from error
-        finally:
-            stop.set()
-            pool.shutdown(wait=True, cancel_futures=True)
+    with Pool(workers, _enlist, sent, folder) as pool:
+        tasks = {pool.submit(_work, number): number for number in shards}
+        while tasks:
+            for task in wait(tasks, return_when=FIRST_COMPLETED).done:
+                task.result()
+                yield tasks.pop(task)
 
 
 def render_on_cluster(job: Job, folder: Path, shards: Iterable[int], scheduler: str) -> Iterator[int]:
@@ -69,16 +52,18 @@ def render_on_cluster(job: Job, folder: Path, shards: Iterable[int], scheduler: 
         OptionError: Dask is not installed, no scheduler answers, or its workers write elsewhere.
     """
     try:
-        from distributed import Client, as_completed
+        from distributed import Client, KilledWorker, as_completed
+        from distributed.comm import resolve_address
     except ImportError as error:
         raise OptionError(
-            "--scheduler needs Dask; install it with pip install 'endotwin[cluster]'"
+            "a scheduler needs Dask; install it with pip install 'endotwin[cluster]'"
         ) from error
     try:
+        resolve_address(scheduler)
         client = Client(scheduler, timeout=SCHEDULER_TIMEOUT_S, set_as_default=False)
     except (OSError, ValueError, TimeoutError) as error:
         raise OptionError(f"no Dask scheduler answers at {scheduler!r}; check the address") from error
-    with client, client.as_current():
+    with _silent("distributed"), client, client.as_current():
         if not client.scheduler_info(n_workers=-1)["workers"]:
             raise OptionError(
                 f"the Dask scheduler at {scheduler} has no workers; start some with 'dask worker'"
@@ -96,35 +81,45 @@ def render_on_cluster(job: Job, folder: Path, shards: Iterable[int], scheduler: 
                     )
                 yield number
                 task.release()
+        except (CancelledError, KilledWorker) as error:
+            raise OutputError(
+                f"the Dask scheduler at {scheduler} or its workers were lost; start them again"
+            ) from error
         finally:
             client.cancel(tasks)
 
 
+@contextmanager
+def _silent(library: str) -> Iterator[None]:
+    """What goes wrong in the block is told by our own errors, not by the library's log as well."""
+    names = [name for name in logging.root.manager.loggerDict if name.partition(".")[0] == library]
+    loud = [logger for logger in map(logging.getLogger, names) if not logger.disabled]
+    for logger in loud:
+        logger.disabled = True
+    try:
+        yield
+    finally:
+        for logger in loud:
+            logger.disabled = False
+
+
 # In the worker
 
-_bench: tuple[Job, Labeller, Path, object] | None = None
+_bench: tuple[Job, Labeller, Path] | None = None
 _building = Lock()
 
 
-def _enlist(sent: Path, folder: Path, stop: object) -> None:
+def _enlist(sent: Path, folder: Path) -> None:
     """Make this process a worker for the job in the file ``sent``."""
     global _bench
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    signal.signal(signal.SIGTERM, signal.SIG_DFL)
-    Thread(target=_end_with_parent, daemon=True).start()
     _keep_to_one_core()
     job = pickle.loads(sent.read_bytes())
-    _bench = (job, Labeller(job), folder, stop)
-
-
-def _end_with_parent() -> None:
-    multiprocessing.parent_process().join()
-    os._exit(1)
+    _bench = (job, Labeller(job), folder)
 
 
 def _work(number: int) -> None:
-    job, labeller, folder, stop = _bench
-    render_shard(job, labeller, folder, number, stop.is_set)
+    job, labeller, folder = _bench
+    render_shard(job, labeller, folder, number)
 
 
 def _work_for(job: Job, folder: Path, number: int) -> int:
@@ -133,7 +128,7 @@ def _work_for(job: Job, folder: Path, number: int) -> int:
     with _building:
         if _bench is None or _bench[0] is not job:
             _keep_to_one_core()
-            _bench = (job, Labeller(job), folder, None)
+            _bench = (job, Labeller(job), folder)
         labeller = _bench[1]
     render_shard(job, labeller, folder, number)
     return number

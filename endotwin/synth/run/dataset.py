@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import json
 import logging
 from collections.abc import Callable, Iterator
@@ -15,8 +14,9 @@ import trimesh
 
 from endotwin.cameras import Camera
 from endotwin.errors import EndotwinError, OptionError, OutputError, TwinError
-from endotwin.run.output import check_apart
+from endotwin.run.output import DATASET, check_apart, unwritable
 from endotwin.run.threads import cores
+from endotwin.synth.encodings import FLOW_RANGE_PX
 from endotwin.synth.job import Job
 from endotwin.synth.labels import DEFAULT_LABELS, LABELS
 from endotwin.synth.layouts import LAYOUTS
@@ -45,19 +45,20 @@ class Summary:
     Attributes:
         path: the dataset's folder. frames: how many. bytes: size of all of its files.
         valid: share of the pixels that show surface which the training photos show, over all frames; None
-        where
-            no mask was asked for.
+            where no mask was asked for.
+        advice: what another program must be told to read it; empty where there is nothing.
     """
 
     path: Path
     frames: int
     bytes: int
     valid: float | None
+    advice: str = ""
 
     def __str__(self) -> str:
         size = f"{self.bytes / 1e6:.1f} MB"
         valid = "" if self.valid is None else f", {self.valid:.1%} of the pixels valid"
-        return f"{self.path}: {self.frames} frames, {size}{valid}"
+        return f"{self.path}: {self.frames} frames, {size}{valid}{self.advice and f'; {self.advice}'}"
 
 
 def synthesize(
@@ -140,7 +141,7 @@ def make_job(
         draws=variation.draw(len(trajectory), seed),
         regions=variation.regions,
         labels=labels,
-        images=tuple(image for label in labels for image in LABELS[label]),
+        images=tuple(dict.fromkeys(image for label in labels for image in LABELS[label])),
         layout=layout,
         shard_frames=LAYOUTS[layout].shard_frames,
         document=describe(twin, trajectory, seed, labels, layout, camera, variation),
@@ -182,6 +183,7 @@ def _finish(job: Job, partial: Partial) -> None:
     """Write what belongs to all frames, and put the dataset in its place."""
     statistics = total(list(done_shards(partial.path).values()))
     _doubt_exposure(statistics.brightness)
+    _doubt_flow(statistics.flow)
     folder = partial.data
     layout = LAYOUTS[job.layout]
     layout.tables(folder, job)
@@ -193,8 +195,10 @@ def _finish(job: Job, partial: Partial) -> None:
         points = surface.vertices_mm.astype("float64") + surface.origin_mm
         trimesh.Trimesh(points, surface.triangles, process=False).export(folder / "surface.ply")
     document = {**job.document, "coverage": statistics.mean_coverage()}
-    (folder / "dataset.json").write_text(json.dumps(document, indent=1, ensure_ascii=False) + "\n")
     write_datasheet(folder / "datasheet.html", document, statistics)
+    document["files"] = sorted({*partial.kinds(), DATASET})
+    text = json.dumps(document, indent=1, ensure_ascii=False) + "\n"
+    (folder / DATASET).write_text(text, encoding="utf-8", errors="backslashreplace")
     partial.finish()
 
 
@@ -208,10 +212,21 @@ def _doubt_exposure(brightness: np.ndarray) -> None:
             )
 
 
+def _doubt_flow(counts: dict[str, list[int]]) -> None:
+    """Warn where flow is beyond what C3VD's code can say, with the share that is lost."""
+    for name, (flowing, lost) in counts.items():
+        if lost:
+            logger.warning(
+                "%.1f %% of the %s is beyond the ±%g px of its code and lost; ask for %s_exr or %s_npz too",
+                *(100 * lost / flowing, name, FLOW_RANGE_PX, name, name),
+            )
+
+
 def _summary(out: Path) -> Summary:
-    document = json.loads((out / "dataset.json").read_text())
+    document = json.loads((out / DATASET).read_text(encoding="utf-8"))
     size = sum(file.stat().st_size for file in out.rglob("*") if file.is_file())
-    return Summary(out, document["frames"], size, document["coverage"].get("valid"))
+    advice = LAYOUTS[document["format"]].advice
+    return Summary(out, document["frames"], size, document["coverage"].get("valid"), advice)
 
 
 @contextmanager
@@ -223,19 +238,16 @@ def _resumable(partial: Partial) -> Iterator[None]:
         if not done_shards(partial.path):
             partial.remove()
             if isinstance(error, OSError):
-                raise _out_of_disk(error, partial, "") from error
+                raise _unwritable(error, partial) from error
             raise
         kept = f"what is done is kept in {partial.path}, and the same command goes on from there"
         if isinstance(error, OSError):
-            raise _out_of_disk(error, partial, f"; {kept}") from error
+            raise OutputError(f"{_unwritable(error, partial)}; {kept}") from error
         if isinstance(error, EndotwinError):
             raise type(error)(f"{error}; {kept}") from error
         error.add_note(kept)
         raise
 
 
-def _out_of_disk(error: OSError, partial: Partial, kept: str) -> OutputError:
-    reason = (
-        "the disk is full" if error.errno in (errno.ENOSPC, errno.EDQUOT) else error.strerror or str(error)
-    )
-    return OutputError(f"{error.filename or partial.path} cannot be written: {reason}; make room{kept}")
+def _unwritable(error: OSError, partial: Partial) -> OutputError:
+    return unwritable(Path(error.filename or partial.path), error)

@@ -41,7 +41,11 @@ def write_datasheet(path: Path, document: dict, statistics: Statistics) -> None:
     ]
     head = '<!doctype html><html lang="en"><meta charset="utf-8"><title>endotwin dataset</title>'
     head += f"<style>{STYLE}</style>"
-    path.write_text(head + "\n".join(section for section in sections if section) + "\n", encoding="utf-8")
+    path.write_text(
+        head + "\n".join(section for section in sections if section) + "\n",
+        encoding="utf-8",
+        errors="backslashreplace",
+    )
 
 
 def _pictures(statistics: Statistics) -> str:

@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import fcntl
 import json
+import re
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import BinaryIO
 
 from endotwin.errors import OutputError
-from endotwin.run.output import DATASET, check_free
+from endotwin.run.output import DATASET, IN_PYTHON, check_free, move_folder, unwritable
 from endotwin.synth.run.shard import DATA, DONE
 
-JOB, LOCK, OLD = "job.json", "lock", "old"
+JOB, LOCK, GOING = "job.json", "lock", "going"
 
 
 class Partial:
@@ -41,8 +43,7 @@ class Partial:
             check_free(self.out, overwrite, DATASET)
         if self.path.exists() and any(self.path.iterdir()) and not (self.path / LOCK).exists():
             raise OutputError(f"{self.path} is no unfinished dataset; move it away, or choose another name")
-        self.path.mkdir(parents=True, exist_ok=True)
-        with (self.path / LOCK).open("w") as lock:
+        with self._lock() as lock:
             try:
                 fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError as error:
@@ -54,26 +55,42 @@ class Partial:
                 self._begin(digest, overwrite)
             yield finished
 
+    def _lock(self) -> BinaryIO:
+        """The file that a run holds while it is at work here, in the folder, which is made."""
+        try:
+            self.path.mkdir(parents=True, exist_ok=True)
+            return (self.path / LOCK).open("wb")
+        except OSError as error:
+            self._vanish()
+            raise unwritable(self.path, error) from error
+
     @property
     def data(self) -> Path:
         """Where the dataset grows."""
         return self.path / DATA
 
     def finish(self) -> None:
-        """Put the dataset, now whole, in its place."""
-        if self.out.exists():
-            self._discard(OLD)
-            self.out.rename(self.path / OLD)
-        self.data.rename(self.out)
+        """Put the dataset, now whole, in its place; what others put into the one that it replaces stays."""
+        own = _kinds_of(self.out)
+        move_folder(self.data, self.out, lambda name: own is None or _kind(name) in own)
         self.remove()
+
+    def kinds(self) -> list[str]:
+        """Kinds of files in ``data``, less what others put into the dataset that it replaces."""
+        own = _kinds_of(self.out)
+        guests = set() if own is None else {name for name in _files(self.out) if _kind(name) not in own}
+        return sorted({_kind(name) for name in _files(self.data) if name not in guests})
 
     def remove(self) -> None:
         """Remove all that is left of the unfinished dataset."""
-        for name in (DATA, OLD, DONE, f"{JOB}.part", JOB, LOCK):
+        for name in (DATA, DONE, f"{JOB}.part", JOB, LOCK):
             self._discard(name)
-        self.path.rmdir()
+        self._vanish()
+
+    def _vanish(self) -> None:
+        """Remove the folder, now empty, and the parents that it was made with."""
         with suppress(OSError):  # not empty: the dataset got its place there, or someone else's is
-            for folder in self._missing:
+            for folder in [self.path, *self._missing]:
                 folder.rmdir()
 
     def _begin(self, digest: str, overwrite: bool) -> None:
@@ -81,21 +98,24 @@ class Partial:
         if self._digest() is not None and not overwrite:
             raise OutputError(
                 f"{self.path} is an unfinished dataset of another command, twin or version; finish or "
-                f"remove it, or "
-                "pass --overwrite"
+                f"remove it, or pass --overwrite ({IN_PYTHON})"
             )
-        for name in (JOB, DATA, OLD, DONE):
+        for name in (JOB, DATA, DONE):
             self._discard(name)
-        for name in (DATA, DONE):
-            (self.path / name).mkdir()
-        beside = self.path / f"{JOB}.part"
-        beside.write_text(json.dumps({"digest": digest}) + "\n")
-        beside.replace(self.path / JOB)
+        try:
+            for name in (DATA, DONE):
+                (self.path / name).mkdir()
+            beside = self.path / f"{JOB}.part"
+            beside.write_text(json.dumps({"digest": digest}) + "\n", encoding="utf-8")
+            beside.replace(self.path / JOB)
+        except OSError as error:
+            self.remove()
+            raise unwritable(self.path, error) from error
 
     def _digest(self) -> str | None:
         """Of the job that left the folder; None where there is none."""
         try:
-            return json.loads((self.path / JOB).read_text())["digest"]
+            return json.loads((self.path / JOB).read_text(encoding="utf-8"))["digest"]
         except FileNotFoundError:
             return None
         except (OSError, ValueError, KeyError, TypeError):
@@ -106,13 +126,33 @@ class Partial:
         return self._digest() == digest and self.out.exists() and not self.data.exists()
 
     def _discard(self, name: str) -> None:
-        entry = self.path / name
+        entry, going = self.path / name, self.path / GOING
         if entry.is_dir():
-            shutil.rmtree(entry)
+            shutil.rmtree(going, ignore_errors=True)
+            entry.rename(going)  # at once: a worker of a cluster may live on, and write
         else:
             entry.unlink(missing_ok=True)
+        shutil.rmtree(going, ignore_errors=True)
 
 
 def partial_path(out: Path) -> Path:
     """Where the unfinished dataset of ``out`` grows."""
     return out.absolute().with_name(f"{out.name}.partial")
+
+
+def _kind(name: Path) -> str:
+    """A file's relative path with # for every number: the same for all frames."""
+    return re.sub(r"\d+", "#", name.as_posix())
+
+
+def _files(folder: Path) -> list[Path]:
+    """Relative paths of the files below ``folder``."""
+    return [file.relative_to(folder) for file in folder.rglob("*") if not file.is_dir()]
+
+
+def _kinds_of(dataset: Path) -> set[str] | None:
+    """Kinds of files that a dataset was made of; None where it does not say."""
+    try:
+        return set(json.loads((dataset / DATASET).read_text(encoding="utf-8"))["files"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return None

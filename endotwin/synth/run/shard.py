@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import tarfile
-from collections.abc import Callable
 from io import BytesIO
 from pathlib import Path
 
@@ -30,10 +29,8 @@ def frame_record(job: Job, index: int) -> dict:
     return {**record, **job.draws[index].to_dict(job.regions)}
 
 
-def render_shard(
-    job: Job, labeller: Labeller, folder: Path, number: int, stopped: Callable[[], bool] = lambda: False
-) -> None:
-    """Render shard ``number`` into ``folder`` and mark it as done, unless ``stopped()`` becomes true.
+def render_shard(job: Job, labeller: Labeller, folder: Path, number: int) -> None:
+    """Render shard ``number`` into ``folder`` and mark it as done.
 
     Args:
         folder: of the unfinished dataset: files go to its ``data``, the mark to its ``done``.
@@ -44,8 +41,6 @@ def render_shard(
     if layout.packed:
         tar = _Tar(folder / DATA / f"shard-{number:04d}.tar")
     for index in job.shard(number):
-        if stopped():
-            return
         images = labeller.frame(index)
         statistics.add(images, thumbnail_of=index if index in job.thumbnails else None)
         for name, image in images.items():
@@ -61,21 +56,23 @@ def render_shard(
         tar.close()
     mark = folder / DONE / f"{number:06d}.json"
     beside = mark.with_suffix(f".{os.getpid()}.part")
-    beside.write_text(json.dumps(statistics.to_dict()))
+    beside.write_text(json.dumps(statistics.to_dict()), encoding="utf-8")
     beside.replace(mark)
 
 
 def done_shards(folder: Path) -> dict[int, Statistics]:
     """What is known of the shards that are done, by number."""
     marks = sorted((folder / DONE).glob("*.json")) if (folder / DONE).is_dir() else []
-    return {int(mark.stem): Statistics.from_dict(json.loads(mark.read_text())) for mark in marks}
+    return {
+        int(mark.stem): Statistics.from_dict(json.loads(mark.read_text(encoding="utf-8"))) for mark in marks
+    }
 
 
 def _write(path: Path, content: bytes) -> None:
     try:
         path.write_bytes(content)
     except FileNotFoundError:
-        path.parent.mkdir(parents=True, exist_ok=True)
+        path.parent.mkdir(exist_ok=True)  # but not the dataset's folder, which is gone where the run is
         path.write_bytes(content)
 
 
@@ -83,7 +80,6 @@ class _Tar:
     """A tar file whose bytes depend on its members alone."""
 
     def __init__(self, path: Path):
-        path.parent.mkdir(parents=True, exist_ok=True)
         self._file = tarfile.open(path, "w", format=tarfile.USTAR_FORMAT)  # noqa: SIM115
 
     def add(self, name: str, content: bytes) -> None:

@@ -9,7 +9,7 @@ from typing import Self
 import cv2
 import numpy as np
 
-from endotwin.synth.encodings import encode_color, rgb_order
+from endotwin.synth.encodings import FLOW_RANGE_PX, encode_color, rgb_order
 
 DEPTH_BINS_MM = np.linspace(0, 100, 51)
 BRIGHTNESS_BINS = np.linspace(0, 1, 33)
@@ -31,12 +31,14 @@ class Statistics:
         depth: some of the pixels by depth in DEPTH_BINS_MM; the last bin takes what lies beyond.
         brightness: some of those that show surface, by the mean of the display-encoded channels.
         coverage: for each kind of pixel, its share in each frame, in order.
+        flow: by name of the image, how many pixels have flow, and of how many it is beyond its code.
         thumbnails: JPEG pictures, base64, by the frame's index.
     """
 
     depth: np.ndarray = field(default_factory=lambda: np.zeros(len(DEPTH_BINS_MM) - 1, np.int64))
     brightness: np.ndarray = field(default_factory=lambda: np.zeros(len(BRIGHTNESS_BINS) - 1, np.int64))
     coverage: dict[str, list[float]] = field(default_factory=lambda: {kind: [] for kind in COVERAGE})
+    flow: dict[str, list[int]] = field(default_factory=dict)
     thumbnails: dict[int, str] = field(default_factory=dict)
 
     def add(self, images: dict[str, np.ndarray], thumbnail_of: int | None = None) -> None:
@@ -52,8 +54,16 @@ class Statistics:
             counts = np.bincount(images["mask"].ravel(), minlength=256)
             for kind, value in COVERAGE.items():
                 self.coverage[kind].append(float(counts[value] / images["mask"].size))
+        for name in ("flow", "flow_forward"):
+            if name in images:
+                flows = np.isfinite(images[name]).all(axis=-1)
+                lost = flows & (np.abs(images[name]) > FLOW_RANGE_PX).any(axis=-1)
+                self._add_flow(name, [int(flows.sum()), int(lost.sum())])
         if thumbnail_of is not None:
             self.thumbnails[thumbnail_of] = b64encode(thumbnail(images)).decode()
+
+    def _add_flow(self, name: str, counts: list[int]) -> None:
+        self.flow[name] = [a + b for a, b in zip(self.flow.get(name, [0, 0]), counts, strict=True)]
 
     def merge(self, other: Statistics) -> None:
         """Add the counts of frames that come after these."""
@@ -61,6 +71,8 @@ class Statistics:
         self.brightness += other.brightness
         for kind in COVERAGE:
             self.coverage[kind] += other.coverage[kind]
+        for name, counts in other.flow.items():
+            self._add_flow(name, counts)
         self.thumbnails |= other.thumbnails
 
     def mean_coverage(self) -> dict[str, float]:
@@ -73,6 +85,7 @@ class Statistics:
             "depth": self.depth.tolist(),
             "brightness": self.brightness.tolist(),
             "coverage": self.coverage,
+            "flow": self.flow,
             "thumbnails": self.thumbnails,
         }
 
@@ -83,6 +96,7 @@ class Statistics:
             np.array(content["depth"], np.int64),
             np.array(content["brightness"], np.int64),
             content["coverage"],
+            content["flow"],
             {int(index): picture for index, picture in content["thumbnails"].items()},
         )
 

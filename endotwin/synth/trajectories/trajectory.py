@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 
@@ -12,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from endotwin.cameras import Camera
 from endotwin.errors import TrajectoryError
 from endotwin.run.streams import Stream
-from endotwin.sequence.poses import frame_times, read_poses
+from endotwin.sequence.poses import as_poses, frame_times, read_poses
 from endotwin.synth.trajectories.flight import FlightOptions, fly
 from endotwin.synth.trajectories.keyframes import SplineOptions, spline_through
 from endotwin.synth.trajectories.orbit import OrbitOptions, orbit
@@ -25,7 +26,7 @@ REDRAWS = 200
 """Tries to move one pose at random before giving up."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Trajectory:
     """Poses to render, all inside the lumen and within the limits.
 
@@ -69,14 +70,18 @@ KINDS = {
 
 
 def parse_trajectory(
-    spec: str, twin: Twin, seed: int, camera: Camera | None = None, limits: Limits | None = None
+    spec: str | Path | np.ndarray,
+    twin: Twin,
+    seed: int,
+    camera: Camera | None = None,
+    limits: Limits | None = None,
 ) -> Trajectory:
     """The trajectory that ``spec`` names, in the twin's world frame; the same for the same seed.
 
     Args:
         spec: a pose file (C3VD ``pose.txt``, TUM trajectory, ``transforms.json``), or ``KIND:KEY=VALUE,…``
-        with
-            a kind among ``KINDS`` and the keys of its options; ``spline:FILE,…`` begins with a pose file.
+            with a kind among ``KINDS`` and the keys of its options; ``spline:FILE,…`` begins with a pose
+            file. Or the poses themselves, [N, 4, 4].
         seed: of all that is drawn at random.
         camera: to look through; the twin's own unless given.
         limits: what each pose must keep. Random poses are drawn again until they do; others are dropped.
@@ -87,14 +92,18 @@ def parse_trajectory(
             no pose keeps the limits.
         SequenceError: the twin's sequence is needed, and that is gone.
     """
+    made_up = not isinstance(spec, str | os.PathLike)
+    poses, spec = (as_poses(spec), "an array") if made_up else (None, os.fspath(spec))
     kind, _, text = spec.partition(":")
-    if kind not in KINDS and not Path(spec).is_file():
+    if not made_up and kind not in KINDS and not Path(spec).is_file():
         raise TrajectoryError(
             f"trajectory {spec!r} is neither a pose file nor a known kind; write {allowed_specs()}"
         )
     gate = Gate(twin, camera or twin.camera, limits or Limits())
+    if made_up:
+        return _given(poses, frame_times(len(poses)), spec, "poses of an array", gate)
     if kind not in KINDS:
-        return _from_file(Path(spec), gate)
+        return _given(*read_poses(spec), spec, f"poses of the file {Path(spec).name}", gate)
     if kind == "spline":
         name, _, text = text.partition(",")
         if not Path(name).is_file():
@@ -181,20 +190,20 @@ def _kept(
     )
 
 
-def _from_file(path: Path, gate: Gate) -> Trajectory:
-    """The poses in a file, each of which must lie inside the surface."""
-    poses, timestamps_s = read_poses(path)
+def _given(
+    poses: np.ndarray, timestamps_s: np.ndarray, name: str, description: str, gate: Gate
+) -> Trajectory:
+    """The poses that were given, each of which must lie inside the surface."""
     findings = gate.judge(poses)
     outside = np.flatnonzero(~findings.outlook.inside)
     if len(outside):
         first = int(outside[0])
         others = f" ({len(outside)} of its {len(poses)} poses cannot be used)" if len(outside) > 1 else ""
         raise TrajectoryError(
-            f"pose {first} of {path} {gate.fault(findings, first)}{others}; poses are camera-to-world, in "
-            f"mm, "
-            "OpenCV axes, in the frame of the twin's sequence"
+            f"pose {first} of {name} {gate.fault(findings, first)}{others}; poses are camera-to-world, in "
+            "mm, OpenCV axes, in the frame of the twin's sequence"
         )
-    return _kept(path.name, poses, timestamps_s, f"poses of the file {path.name}", gate, findings)
+    return _kept(Path(name).name, poses, timestamps_s, description, gate, findings)
 
 
 def _jittered(spec: str, options: JitterOptions, twin: Twin, gate: Gate, seed: int) -> Trajectory:

@@ -63,7 +63,9 @@ def _painted(file: Path, surface: Surface) -> np.ndarray:
     """Weights [V]: of an array of one a vertex, or the brightness of a painted mesh's nearest vertex."""
     count = len(surface.vertices_mm)
     try:
-        if file.suffix == ".npy":
+        if file.suffix.lower() not in (".npy", ".ply"):
+            raise ValueError("its name does not say which")
+        if file.suffix.lower() == ".npy":
             weight = np.load(file, allow_pickle=False)
             if weight.shape != (count,) or not np.isfinite(weight.astype(np.float64)).all():
                 raise ValueError(f"its shape is {weight.shape}, the surface has {count} vertices")

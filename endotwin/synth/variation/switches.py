@@ -33,7 +33,7 @@ def switched(effects: Effects, switches: Iterable[tuple[str, bool]]) -> Effects:
     return effects
 
 
-def equipped(twin: Twin, states: Mapping[str, str], trajectory: str) -> Twin:
+def equipped(twin: Twin, states: Mapping[str, str], trajectory: object) -> Twin:
     """The twin with effects on or off as ``states`` say, as strong as its sequence shows them to be.
 
     Raises:
@@ -50,8 +50,8 @@ def equipped(twin: Twin, states: Mapping[str, str], trajectory: str) -> Twin:
         if state != "on" or name in effects:
             continue
         if name in FITTED and name != "coat":
-            raise OptionError(f"the twin has no {name}; 'endotwin fit' with --effects {name}=on finds it")
-        if name in NEED_VELOCITY and trajectory.startswith("jitter"):
+            raise OptionError(f"the twin has no {name}; a fit with its effect {name} on finds it")
+        if name in NEED_VELOCITY and str(trajectory).startswith("jitter"):
             raise OptionError(f"{name} needs poses that follow each other, and those of jitter do not")
         found = effect_class(name).evidence(twin.sequence())[0] if name in RENDERED else None
         effects = effects.including(found or effect_class(name)())

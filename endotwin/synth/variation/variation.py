@@ -8,11 +8,11 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
-import yaml
 
 from endotwin.effects import NAMES as EFFECTS
 from endotwin.errors import OptionError
 from endotwin.run.streams import Stream
+from endotwin.run.yamltext import parsed
 from endotwin.synth.variation.edits import (
     LIGHTS,
     MATERIALS,
@@ -179,10 +179,9 @@ def read_variation(path: Path, twin: Twin, before: Variation) -> Variation:
         OptionError: the file cannot be read, or a part of it is not understood.
     """
     try:
-        content = yaml.safe_load(Path(path).read_text(encoding="utf-8")) or {}
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        reason = " ".join(str(error).split())
-        raise OptionError(f"{path} cannot be read as YAML ({reason}); check the file") from error
+        content = parsed(Path(path).read_text(encoding="utf-8-sig")) or {}
+    except (OSError, ValueError) as error:
+        raise OptionError(f"{path} cannot be read as YAML ({error}); check the file") from error
     _require_mapping(content, KEYS, str(path))
     kinds = {kind: _ranges(content.get(kind), kind, kind, path) for kind in NAMES}
     described = content.get("regions") or []

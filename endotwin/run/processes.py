@@ -1,0 +1,64 @@
+"""Worker processes that end with the run, however it ends: at once, and without a word of their own."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from threading import Thread
+
+from endotwin.errors import OutputError
+
+
+class Pool(ProcessPoolExecutor):
+    """So many spawned processes, which Ctrl-C does not reach, each begun by ``begin(*arguments)``.
+
+    A block that an error leaves kills them, whatever they are at. They end with this process too, even where
+    that is killed. A script that makes one needs ``if __name__ == "__main__":``.
+
+    Raises:
+        OutputError: at the end of the block, where a process died.
+    """
+
+    def __init__(self, workers: int, begin: Callable | None = None, *arguments: object) -> None:
+        super().__init__(workers, multiprocessing.get_context("spawn"), _enlist, (begin, arguments))
+
+    def submit(self, function: Callable, /, *arguments: object) -> Future:
+        with _held_back(signal.SIGINT):  # the first call starts the processes, which inherit this
+            return super().submit(function, *arguments)
+
+    def __exit__(self, kind: type | None, error: BaseException | None, trace: object) -> None:
+        if kind is not None:
+            for process in list((self._processes or {}).values()):  # there is no public way before 3.14
+                process.kill()
+        super().__exit__(kind, error, trace)
+        if isinstance(error, BrokenProcessPool):
+            raise OutputError(
+                "a worker process died, perhaps for want of memory; try fewer workers"
+            ) from error
+
+
+@contextmanager
+def _held_back(number: int) -> Iterator[None]:
+    """The signal waits until the block has ended."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {number})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def _enlist(begin: Callable | None, arguments: tuple) -> None:
+    """Make this process a worker."""
+    Thread(target=_end_with_parent, daemon=True).start()
+    if begin:
+        begin(*arguments)
+
+
+def _end_with_parent() -> None:
+    multiprocessing.parent_process().join()
+    os._exit(1)

@@ -1,0 +1,69 @@
+"""A full disk, met by every command that writes: one sentence with file and room, and all is as it was."""
+
+import shutil
+from pathlib import Path
+
+import pytest
+import tube_sequence
+from command_line import invoke
+from faults import full_disk
+
+import endotwin
+
+pytestmark = pytest.mark.slow
+
+COMMANDS = {
+    "fuse": ("new", "fuse tube -o new"),
+    "fuse over a twin": ("twin", "fuse tube -o twin --overwrite"),
+    "fit": ("new", "fit twin -o new --budget 1"),
+    "fit in place": ("twin", "fit twin --overwrite --budget 1"),
+    "eval": ("twin", "eval twin"),
+    "eval with a picture": ("sheet.png", "eval twin --sheet sheet.png"),
+    "eval with a profile": ("profile.json", "eval read_only --profile profile.json"),
+    "synth": ("new", "synth twin --trajectory jitter:frames=2 -o new"),
+    "synth of tars": ("new", "synth twin --trajectory jitter:frames=2 --layout webdataset -o new"),
+    "preview": ("new.png", "synth twin --trajectory jitter:frames=2 --preview new.png"),
+    "inspect": ("new.png", "inspect twin --screenshot new.png --map base_color"),
+    "tradeoff": ("new", "tradeoff tube -o new --rungs draft --repeats 1"),
+}
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory) -> Path:
+    """A sequence ``tube`` and its fitted twin ``twin``."""
+    folder = tmp_path_factory.mktemp("made")
+    tube_sequence.write(folder / "tube", 4, 48, 36)
+    endotwin.fit_twin(endotwin.fuse_twin(folder / "tube")).save(folder / "twin")
+    return folder
+
+
+@pytest.fixture
+def here(made, tmp_path, monkeypatch) -> Path:
+    """A copy of them to stand in."""
+    for name in ("tube", "twin"):
+        shutil.copytree(made / name, tmp_path / name)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def contents(folder: Path) -> dict[Path, bytes | None]:
+    return {entry: entry.read_bytes() if entry.is_file() else None for entry in folder.rglob("*")}
+
+
+@pytest.mark.parametrize("after", [0, 2])
+@pytest.mark.parametrize("name", COMMANDS)
+def test_a_command_that_meets_a_full_disk_says_so_and_changes_nothing(here, capfd, monkeypatch, name, after):
+    file, command = COMMANDS[name]
+    if "read_only" in command:  # the scores have no place, so that the profile is the first to be written
+        monkeypatch.setattr("endotwin.cli.eval._keep", lambda *_: False)
+        command = command.replace("read_only", "twin")
+    before = contents(here)
+    with full_disk(here, after):
+        code = invoke(*command.split())
+    *_, said = capfd.readouterr().err.splitlines()
+    assert code == 2
+    assert (
+        said.startswith("error: ") and f"{file}" in said and "the disk is full" in said and "MB free" in said
+    )
+    kept = here / "new.partial" if name == "tradeoff" else None  # the same command goes on from there
+    assert {entry: content for entry, content in contents(here).items() if entry != kept} == before

@@ -1,0 +1,134 @@
+"""The library in other hands: what makes sense is taken, and the rest is refused by a typed sentence."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tube_sequence
+import tube_twin
+
+import endotwin
+from endotwin.errors import EndotwinError, OptionError, TrajectoryError, TwinError
+
+
+@pytest.fixture(scope="module")
+def twin() -> endotwin.Twin:
+    return tube_twin.fitted(tube_twin.seen(tube_twin.surface()))
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory) -> Path:
+    """A sequence ``tube`` and its twin ``twin``, which is not fitted."""
+    folder = tmp_path_factory.mktemp("made")
+    tube_sequence.write(folder / "tube", 4, 48, 36)
+    endotwin.fuse_twin(folder / "tube").save(folder / "twin")
+    return folder
+
+
+def test_a_pose_may_be_a_list(twin):
+    pose = tube_twin.pose(0.5)
+    renderer = endotwin.Renderer(twin)
+    np.testing.assert_array_equal(renderer.view(pose.tolist()).color, renderer.view(pose).color)
+
+
+@pytest.mark.parametrize(
+    ("pose", "says"),
+    [
+        (np.eye(3), r"matrices \[N, 4, 4\].*\(3, 3\)"),
+        (np.full((4, 4), np.nan), "NaN"),
+        (np.diag([2.0, 1, 1, 1]), "not rigid"),
+        ("pose.txt", "str"),
+        (None, "NoneType"),
+        ([[1, 2], [3]], "list"),
+        ([], "list"),
+    ],
+)
+def test_what_is_no_pose_is_refused(twin, pose, says):
+    with pytest.raises(TrajectoryError, match=says):
+        endotwin.Renderer(twin).view(pose)
+
+
+def test_a_mask_of_another_shape_is_refused(twin):
+    with pytest.raises(OptionError, match=r"\(2, 2\)"):
+        endotwin.Renderer(twin).view(tube_twin.pose(0.5), np.ones((2, 2), bool))
+
+
+@pytest.mark.parametrize("form", [np.asarray, list, lambda poses: poses.tolist()])
+def test_a_trajectory_may_be_an_array_and_an_edit_a_string(twin, tmp_path, form):
+    poses = np.stack([tube_twin.pose(s) for s in (0.4, 0.5)])
+    made = endotwin.synthesize(
+        twin, form(poses), tmp_path / "one", material="roughness*1.3", light="intensity*0.8", labels=["rgb"]
+    )
+    assert made.frames == 2
+    file = tmp_path / "pose.txt"
+    file.write_text("".join(",".join(map(repr, pose.T.ravel().tolist())) + "\n" for pose in poses))
+    options = {"material": ["roughness*1.3"], "light": ["intensity*0.8"], "labels": "rgb"}
+    endotwin.synthesize(twin, file, tmp_path / "two", **options)
+    for name in ("0000_color.png", "0001_color.png", "pose.txt"):
+        assert (tmp_path / "one" / name).read_bytes() == (tmp_path / "two" / name).read_bytes()
+
+
+@pytest.mark.parametrize("poses", [np.eye(3)[None], np.zeros((0, 4, 4)), np.eye(4)[None] * 1e9, 7])
+def test_poses_that_cannot_be_rendered_are_refused(twin, tmp_path, poses):
+    with pytest.raises(TrajectoryError):
+        endotwin.synthesize(twin, poses, tmp_path / "dataset")
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("edit", ["roughness", "gloss*2", ["r", "o"], ""])
+def test_an_edit_that_makes_no_sense_is_named(twin, tmp_path, edit):
+    with pytest.raises(OptionError):
+        endotwin.synthesize(twin, [tube_twin.pose(0.5)], tmp_path / "dataset", material=edit)
+
+
+@pytest.mark.parametrize("labels", ["", [], "rgb,colour"])
+def test_labels_that_are_none_are_refused(twin, tmp_path, labels):
+    with pytest.raises(OptionError, match="no label"):
+        endotwin.synthesize(twin, [tube_twin.pose(0.5)], tmp_path / "dataset", labels=labels)
+
+
+def test_a_twin_may_be_named_by_its_folder(made, tmp_path):
+    fitted = endotwin.fit_twin(made / "twin", budget_s=1)
+    fitted.save(tmp_path / "twin")
+    assert endotwin.evaluate(str(tmp_path / "twin")).frames
+    assert endotwin.Renderer(tmp_path / "twin").twin.fitted
+    assert endotwin.synthesize(tmp_path / "twin", "jitter:frames=1", tmp_path / "dataset").frames == 1
+    endotwin.inspect(tmp_path / "twin", tmp_path / "twin.png", "roughness")
+
+
+@pytest.mark.parametrize(
+    "call",
+    [
+        lambda twin: endotwin.fit_twin(twin),
+        lambda twin: endotwin.evaluate(twin),
+        lambda twin: endotwin.Renderer(twin),
+        lambda twin: endotwin.synthesize(twin, "jitter:", "nowhere"),
+        lambda twin: endotwin.inspect(twin),
+    ],
+)
+@pytest.mark.parametrize("no_twin", [None, 3, "nowhere"])
+def test_what_is_no_twin_is_refused(call, no_twin):
+    with pytest.raises(TwinError, match=r"no twin|not a twin"):
+        call(no_twin)
+
+
+@pytest.mark.parametrize("call", [endotwin.open_sequence, endotwin.fuse_twin])
+@pytest.mark.parametrize("no_sequence", [None, 3, "nowhere"])
+def test_what_is_no_sequence_is_refused(call, no_sequence):
+    with pytest.raises(EndotwinError):
+        call(no_sequence)
+
+
+def test_twins_and_their_parts_can_be_compared_and_kept_in_sets(twin):
+    other = tube_twin.fitted(twin.surface)
+    for mine, its in ((twin, other), (twin.materials, other.materials)):
+        assert mine == mine and mine != its and len({mine, its, mine}) == 2
+    assert twin.surface in {twin.surface}
+
+
+def test_messages_of_the_library_name_what_python_calls_it(twin, made, tmp_path):
+    with pytest.raises(EndotwinError, match="overwrite=True"):
+        twin.save(made / "twin")
+    with pytest.raises(OptionError) as refused:
+        endotwin.fit_twin(made / "twin", epochs=3)
+    assert "--" not in str(refused.value)
