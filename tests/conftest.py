@@ -6,6 +6,9 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+import tube_sequence
+
+import endotwin
 
 
 @pytest.fixture(scope="session")
@@ -20,6 +23,15 @@ def data_root() -> Path:
 def example() -> Path:
     """The bundled example sequence."""
     return Path(__file__).parents[1] / "examples" / "colon_small"
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory) -> Path:
+    """A folder with a sequence ``tube`` and its fitted twin ``twin``, of one test module alone."""
+    folder = tmp_path_factory.mktemp("made")
+    tube_sequence.write(folder / "tube", 4, 48, 36)
+    endotwin.fit_twin(endotwin.fuse_twin(folder / "tube")).save(folder / "twin")
+    return folder
 
 
 @pytest.fixture(autouse=True)

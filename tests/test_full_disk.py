@@ -4,11 +4,8 @@ import shutil
 from pathlib import Path
 
 import pytest
-import tube_sequence
 from command_line import invoke
 from faults import full_disk
-
-import endotwin
 
 pytestmark = pytest.mark.slow
 
@@ -26,15 +23,6 @@ COMMANDS = {
     "inspect": ("new.png", "inspect twin --screenshot new.png --map base_color"),
     "tradeoff": ("new", "tradeoff tube -o new --rungs draft --repeats 1"),
 }
-
-
-@pytest.fixture(scope="module")
-def made(tmp_path_factory) -> Path:
-    """A sequence ``tube`` and its fitted twin ``twin``."""
-    folder = tmp_path_factory.mktemp("made")
-    tube_sequence.write(folder / "tube", 4, 48, 36)
-    endotwin.fit_twin(endotwin.fuse_twin(folder / "tube")).save(folder / "twin")
-    return folder
 
 
 @pytest.fixture

@@ -7,21 +7,9 @@ import sys
 from pathlib import Path
 
 import pytest
-import tube_sequence
 from command_line import invoke
 
-import endotwin
-
 pytestmark = pytest.mark.slow
-
-
-@pytest.fixture(scope="module")
-def made(tmp_path_factory) -> Path:
-    """A sequence ``tube`` and its fitted twin ``twin``."""
-    folder = tmp_path_factory.mktemp("made")
-    tube_sequence.write(folder / "tube", 4, 48, 36)
-    endotwin.fit_twin(endotwin.fuse_twin(folder / "tube")).save(folder / "twin")
-    return folder
 
 
 @pytest.mark.parametrize(

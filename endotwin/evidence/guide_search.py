@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 from scipy.optimize import minimize
@@ -40,8 +41,8 @@ def found_guides(probe: Probe, base: Hypothesis, forced: bool) -> Guides:
     """Positions of one to three guides that predict held-out pixels better than ``base``, camera frame; the
     lens where none do.
 
-    A glance at unrefined positions tells whether a search is worth its time. With ``forced`` there is always
-    a position: that of the most guides, if none is worth it.
+    One guide, and a glance at two and three, tell whether a search is worth its time. With ``forced`` there
+    is always a position: that of the most guides, if none is worth it.
     """
     search = Search.of(probe, base)
     if not forced and not search.hints():
@@ -65,6 +66,7 @@ class Search:
         seen = [probe.visible(guide) for guide in self._candidates]
         self._at_risk = np.flatnonzero(~np.logical_and.reduce(seen))
         self._radius_mm = float(np.abs(self._candidates).max())
+        self.best = cache(self._best)
 
     @classmethod
     def of(cls, probe: Probe, base: Hypothesis) -> Search:
@@ -79,7 +81,7 @@ class Search:
         models = [self._probe.fit(self._with(guides_mm)) for guides_mm in (alone, *about)]
         return any(self._probe.compare(self._base, model).hints for model in models)
 
-    def best(self, fewer_mm: Guides) -> Guides:
+    def _best(self, fewer_mm: Guides) -> Guides:
         """The best positions with one guide more than there are in ``fewer_mm``."""
         known = np.array(fewer_mm, np.float32).reshape(-1, 3)
         start_mm = min([*self._joined(known), *self._about(len(known) + 1)], key=self._loss)
@@ -126,9 +128,6 @@ class Search:
         visible = np.ones((len(self._probe), len(guides_mm)), bool)
         for k, guide in enumerate(guides_mm):
             visible[self._at_risk, k] = self._probe.visible(guide, self._at_risk)
-        return self._fitted_loss(guides_mm, visible)
-
-    def _fitted_loss(self, guides_mm: np.ndarray, visible: np.ndarray) -> float:
         return self._probe.loss(self._with(guides_mm), self._base, visible)
 
     def _with(self, guides_mm: np.ndarray) -> Hypothesis:

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import tube_sequence
 import tube_twin
 from command_line import invoke
 from damage import WRITERS, Files, damaged, files_of
@@ -73,15 +72,6 @@ def read_all(folder: Path) -> None:
     assert opened.lens_mask.shape == size
     lengths = np.linalg.norm(opened.camera.pixel_directions, axis=2)
     np.testing.assert_allclose(lengths[np.isfinite(lengths)], 1, atol=1e-5)
-
-
-@pytest.fixture(scope="module")
-def made(tmp_path_factory) -> Path:
-    """A sequence ``tube`` and its fitted twin ``twin``."""
-    folder = tmp_path_factory.mktemp("made")
-    tube_sequence.write(folder / "tube", 4, 48, 36)
-    endotwin.fit_twin(endotwin.fuse_twin(folder / "tube")).save(folder / "twin")
-    return folder
 
 
 def spoil_and_run(contents: Files, data: st.DataObject, out: Path, *command: object) -> None:
