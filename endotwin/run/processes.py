@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
-from threading import Thread
+from threading import Thread, current_thread, main_thread
 
 from endotwin.errors import OutputError
 
@@ -28,7 +28,7 @@ class Pool(ProcessPoolExecutor):
         super().__init__(workers, multiprocessing.get_context("spawn"), _enlist, (begin, arguments))
 
     def submit(self, function: Callable, /, *arguments: object) -> Future:
-        with _held_back(signal.SIGINT):  # the first call starts the processes, which inherit this
+        with _held_back(signal.SIGINT, signal.SIGTERM, signal.SIGALRM):  # the first call starts the processes
             return super().submit(function, *arguments)
 
     def __exit__(self, kind: type | None, error: BaseException | None, trace: object) -> None:
@@ -43,13 +43,24 @@ class Pool(ProcessPoolExecutor):
 
 
 @contextmanager
-def _held_back(number: int) -> Iterator[None]:
-    """The signal waits until the block has ended."""
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {number})
+def _held_back(*numbers: int) -> Iterator[None]:
+    """The signals wait until the block has ended; Ctrl-C never reaches a process that is started within.
+
+    The mask, which such a process inherits, holds this thread alone: any other takes the signal, and Python
+    then calls its handler in the main thread, in the midst of the block.
+    """
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    came: list[int] = []
+    within_main = current_thread() is main_thread()
+    handlers = {n: signal.signal(n, lambda number, _: came.append(number)) for n in numbers if within_main}
     try:
         yield
     finally:
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        for number in came[:1]:
+            signal.raise_signal(number)
 
 
 def _enlist(begin: Callable | None, arguments: tuple) -> None:
