@@ -11,10 +11,13 @@ from types import FrameType
 
 RETRY_S = 0.05
 PATIENCE_S = 1.2
-"""Time that a command has to tidy up after itself; what it leaves then, the next one sweeps."""
+"""Time that a command has to heed a signal: a long call of C code does not."""
+TIDY_S = 8.0
+"""Time that it then has to tidy up after itself; what it leaves then, the next one sweeps."""
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
+_heeded = Event()
 _told = Event()
 
 
@@ -36,7 +39,7 @@ def tell(stopped: Stopped) -> int:
 
 
 def lose_patience() -> None:
-    """From now on the process ends PATIENCE_S after SIGINT or SIGTERM, even within a long call of C code."""
+    """From now on the process ends soon after SIGINT or SIGTERM, even within a long call of C code."""
     listening, told = os.pipe()
     os.set_blocking(told, False)
     signal.set_wakeup_fd(told, warn_on_full_buffer=False)
@@ -47,6 +50,8 @@ def _end_after(listening: int) -> None:
     while (number := os.read(listening, 1)[0]) not in SIGNALS:
         pass
     time.sleep(PATIENCE_S)
+    if _heeded.is_set():
+        time.sleep(TIDY_S)
     if not _told.is_set():
         print("stopped", file=sys.stderr, flush=True)
     os._exit(128 + number)
@@ -55,6 +60,7 @@ def _end_after(listening: int) -> None:
 def _stop(number: int, frame: FrameType | None) -> None:
     """Raise Stopped, or try again soon: a library that is being imported would make an ImportError of it."""
     if not _importing(frame):
+        _heeded.set()
         raise Stopped(number)
     signal.signal(signal.SIGALRM, lambda _, later: _stop(number, later))
     signal.setitimer(signal.ITIMER_REAL, RETRY_S)
