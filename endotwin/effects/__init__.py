@@ -13,7 +13,7 @@ from importlib import import_module
 from endotwin.effects.effect import STATES, Decision, Effect
 from endotwin.errors import OptionError
 
-FITTED = ("specular", "offset", "shadows", "interreflection", "gain", "vignetting", "profile", "coat")
+FITTED = ("specular", "offset", "shadows", "interreflection", "gain", "vignetting", "profile", "coat", "film")
 RENDERED = ("noise", "motion_blur", "defocus", "rolling_shutter", "chromatic", "bloom", "lens")
 NAMES = (*FITTED, *RENDERED)
 

@@ -96,12 +96,19 @@ class Relighting:
         solver.relight(replace(solver.samples, bounce=None))
         return replace(state, shared=state.shared.without_scale())
 
+    def bounced(self, samples: Samples, triangles: Tensor, state: State) -> Samples:
+        """``samples`` with the bounce off the materials of ``state``, if light bounces; corners of the
+        ``triangles`` [F, 3] are its points."""
+        if not self.bounces:
+            return samples
+        materials = state.materials
+        roughness = at_pixels(samples, triangles, materials[:, 3:])[:, 0]
+        return self._bouncer.bounced(samples, roughness, materials, triangles, state.shared)
+
     def __call__(self, solver: GaussNewton, state: State) -> None:
         """Relight the samples of ``solver`` as ``state`` says."""
-        samples, materials = solver.samples, state.materials
-        if self.bounces:
-            roughness = at_pixels(samples, solver.triangles, materials[:, 3:])[:, 0]
-            samples = self._bouncer.bounced(samples, roughness, materials, solver.triangles, state.shared)
+        materials = state.materials
+        samples = self.bounced(solver.samples, solver.triangles, state)
         if "gain" in self.effects:
             samples = exposed(samples, self.effects)
             if state.textured:

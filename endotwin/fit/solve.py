@@ -19,6 +19,7 @@ from endotwin.effects import Decision, Effects
 from endotwin.errors import SequenceError
 from endotwin.evidence.coat import judged as judged_coat
 from endotwin.evidence.decide import decide
+from endotwin.fit.film import Model
 from endotwin.fit.gauss_newton import (
     GaussNewton,
     State,
@@ -33,6 +34,7 @@ from endotwin.fit.model import Globals, at_pixels
 from endotwin.fit.tilt import tilted
 from endotwin.fit.unexplained import residual_warning
 from endotwin.fit.within import Within
+from endotwin.light.film import Film
 from endotwin.light.shading import F0_DIELECTRIC, ROUGHNESS_TISSUE
 from endotwin.pixels.length_unit import unit_mm
 from endotwin.pixels.pace import ITERATIONS, LIGHT, Pace
@@ -145,6 +147,9 @@ def fit_twin(twin: Twin, pace: Pace, seed: int, states: Mapping[str, str], price
     with stopwatch.stage("detail"):
         state, normals, left = _find_detail(samples, twin, state, cost, pace, relighting)
         twin = replace(twin, surface=replace(surface, normals=normals))
+    with stopwatch.stage("film"):
+        wanted = states.get("film", "auto") if "specular" in decided.effects else "off"
+        film, wet, judged = Model(twin, state, relighting, caster).film(samples, wanted, pace.report)
     odd = unusual(state.shared)
     if odd:
         logger.warning(
@@ -153,12 +158,13 @@ def fit_twin(twin: Twin, pace: Pace, seed: int, states: Mapping[str, str], price
             *(" and ".join(odd), twin.source.path),
         )
     with stopwatch.stage("price"):
-        decisions = {**decided.decisions, "coat": coat}
+        decisions = {**decided.decisions, "coat": coat, "film": judged}
         if "interreflection" in decided.effects and not relighting.bounces:
             decisions["interreflection"] = _without_bounce(decisions["interreflection"])
         if left is not None and (said := residual_warning(left, twin.sequence(), decisions)):
             logger.warning("%s; 'endotwin check %s' looks for the cause", said, twin.source.path)
-        fitted = price(_fitted(twin, state, relighting.effects, decisions), caster, samples.views)
+        effects = relighting.effects if wet is None else relighting.effects.including(wet)
+        fitted = price(_fitted(twin, state, effects, decisions, film), caster, samples.views)
     return fitted.with_record(
         fit={"method": "twin", "undetermined": list(start.undetermined), **stopwatch.to_dict()}
     )
@@ -304,7 +310,9 @@ def median_edge_mm(surface: Surface) -> float:
     return float(np.median(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)))
 
 
-def _fitted(twin: Twin, state: State, effects: Effects, decisions: Mapping[str, Decision]) -> Twin:
+def _fitted(
+    twin: Twin, state: State, effects: Effects, decisions: Mapping[str, Decision], film: Film | None
+) -> Twin:
     """Materials of the state, with the scale that light and albedo share fixed by ALBEDO_TOP, or by the
     bounce.
 
@@ -327,6 +335,7 @@ def _fitted(twin: Twin, state: State, effects: Effects, decisions: Mapping[str, 
             roughness=np.ascontiguousarray(materials[:, 3]),
             metallic=np.zeros(len(materials), np.float32),
             f0=state.shared.f0 * scale,
+            film=None if film is None else replace(film, weight=film.weight * np.float32(scale)),
         ),
         light=Light(light.L0 / scale, light.n, light.q),
         response=Response(state.shared.gamma),

@@ -144,9 +144,7 @@ def gather(twin: Twin, pace: Pace, seed: int, caster: Caster) -> Samples:
 
     def one(index: int) -> tuple[int, Samples]:
         generator = np.random.default_rng((seed, index))
-        return index, _frame_samples(
-            twin, caster, sequence.frame(index), sequence.lens_mask, share, generator
-        )
+        return index, frame_samples(twin, caster, sequence.frame(index), sequence.lens_mask, share, generator)
 
     read, parts = [], []
     for done, (index, part) in enumerate(ahead(one, pace.photos(frames), THREADS), 1):
@@ -172,7 +170,7 @@ def _shown(part: Samples) -> float:
     return float(((brightest > BLACK) & (brightest < CLIPPED)).float().mean())
 
 
-def _frame_samples(
+def frame_samples(
     twin: Twin,
     caster: Caster,
     frame: Frame,

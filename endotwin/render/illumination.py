@@ -12,11 +12,13 @@ from torch import Tensor
 
 from endotwin.light import shading
 from endotwin.light.bounced import Albedo, BouncedLight, Places
+from endotwin.light.film import mirrored, mirrors
 from endotwin.light.forward import Lit, Lobes, radiance
 from endotwin.light.guides import AT_LENS, COSINE, guided, log_axis, visible_from
 from endotwin.light.incidence import COS_MIN, incidence_on
 from endotwin.light.radiosity import Radiosity
 from endotwin.surface.casting import Caster, Correspondences
+from endotwin.surface.vectors import dot
 from endotwin.twin import Twin
 
 
@@ -51,7 +53,25 @@ class Illumination:
         """The light of the view from ``T_world_camera`` [4, 4]."""
         T_local_camera = self.twin.surface.to_local(T_world_camera)
         irradiance = None if self._albedo is None else self._bounced(T_local_camera)
-        return ViewLight(self.twin, self._caster, T_local_camera, irradiance)
+        return ViewLight(self.twin, self._caster, T_local_camera, irradiance, self._mirrored(T_local_camera))
+
+    def _mirrored(self, T_local_camera: np.ndarray) -> np.ndarray | None:
+        """Radiance that the film at each vertex sends to the camera, float32 [V]; None without a film."""
+        twin, effects, film = self.twin, self.twin.effects, self.twin.materials.film
+        if film is None or "film" not in effects:
+            return None
+        guides_mm = np.asarray(effects.guides_mm or AT_LENS, np.float32)
+        rotation = T_local_camera[:3, :3].astype(np.float32)
+        points_mm = (twin.surface.vertices_mm[film.vertex] - T_local_camera[:3, 3]) @ T_local_camera[:3, :3]
+        points_mm, visible = points_mm.astype(np.float32), None
+        if "shadows" in effects:
+            visible = visible_from(self._caster, T_local_camera, points_mm, guides_mm)
+        half, strength = mirrors(points_mm, guides_mm, effects.profile, _log_light(twin), visible)
+        across = np.cross((film.normal @ rotation)[:, None], half)
+        lobe = mirrored(strength, torch.from_numpy(dot(across, across)), effects["film"].roughness).sum(dim=1)
+        radiance = np.zeros(len(twin.surface.vertices_mm), np.float32)
+        radiance[film.vertex] = effects["film"].amount * film.weight * lobe.numpy()
+        return radiance
 
     def _bounced(self, T_local_camera: np.ndarray) -> np.ndarray:
         """Indirect irradiance of the vertices, float32 [V, 3], with L0 = 1."""
@@ -69,12 +89,14 @@ class ViewLight:
     Attributes:
         T_local_camera: the pose in the surface's frame, float64 [4, 4].
         irradiance: what other tissue throws on each vertex, float32 [V, 3], with L0 = 1; None: nothing.
+        film: radiance that the film at each vertex sends to the camera, float32 [V]; None: nothing.
     """
 
     twin: Twin
     caster: Caster
     T_local_camera: np.ndarray
     irradiance: np.ndarray | None
+    film: np.ndarray | None
 
     def radiance(
         self, hits: Correspondences, directions: np.ndarray, normals: np.ndarray, material: Tensor
@@ -97,9 +119,11 @@ class ViewLight:
             bounced = torch.from_numpy(hits.interpolate(twin.surface, self.irradiance))
             more = {"irradiance": bounced, "gloss": gloss}
         lit, visible = self._lit(hits, directions, normals, more)
-        log_light = (math.log(max(twin.light.L0, 1e-30)), twin.light.n, twin.light.q)
         base_color = material[:, :3] * (1 - material[:, 4:])
-        return radiance(lit, log_light, base_color, roughness, _lobes(twin)), visible
+        x = radiance(lit, _log_light(twin), base_color, roughness, _lobes(twin))
+        if self.film is not None:
+            x = x + torch.from_numpy(hits.interpolate(twin.surface, self.film))[:, None]
+        return x, visible
 
     def _lit(
         self, hits: Correspondences, directions: np.ndarray, normals: np.ndarray, more: dict[str, Tensor]
@@ -118,6 +142,11 @@ class ViewLight:
             visible = visible_from(self.caster, self.T_local_camera, points_mm, guides_mm)
         guides = guided(points_mm, normals, guides_mm, effects.profile, visible)
         return Lit(_cos_o(hits, directions, normals), guides, **more), visible
+
+
+def _log_light(twin: Twin) -> tuple[float, float, float]:
+    """ln L0, n and q."""
+    return math.log(max(twin.light.L0, 1e-30)), twin.light.n, twin.light.q
 
 
 def _lobes(twin: Twin) -> Lobes:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 if TYPE_CHECKING:
+    from endotwin.light.film import Film
     from endotwin.twin.twin import Twin
 
 SURFACE = {
@@ -61,10 +62,23 @@ def _require_fit(twin: Twin, count: int) -> None:
         values = getattr(materials, name)
         _require_array(name, values, kind, (count, columns)[: 2 if columns else 1])
         _require(name, bool(((values >= 0) & (values <= 1)).all()))
+    if materials.film is not None:
+        _require_film(materials.film, count)
     _require("f0", _number(materials.f0) and materials.f0 >= 0)
     _require("the diffuse lobe", materials.diffuse in ("burley", "lambert"))
     _require("the light", _positive(light.L0) and _number(light.n) and _number(light.q))
     _require("gamma", _positive(twin.response.gamma))
+
+
+def _require_film(film: Film, count: int) -> None:
+    size = len(film.vertex)
+    for name, shape in (("normal", (size, 3)), ("weight", (size,))):
+        values = getattr(film, name)
+        _require("the film", values.dtype == np.float32 and values.shape == shape)
+        _require("the film", bool(np.isfinite(values).all()))
+    vertex = film.vertex
+    _require("the film", vertex.dtype == np.int32 and vertex.ndim == 1 and bool((np.diff(vertex) > 0).all()))
+    _require("the film", not size or (vertex[0] >= 0 and vertex[-1] < count and film.weight.min() >= 0))
 
 
 def _require_array(name: str, values: np.ndarray, kind: type, shape: tuple[int, ...]) -> None:

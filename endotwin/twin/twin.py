@@ -16,6 +16,7 @@ from safetensors.numpy import load_file, save
 from endotwin.cameras import Camera, camera_from_dict
 from endotwin.effects import Decision, Effects
 from endotwin.errors import SequenceError, TwinError
+from endotwin.light.film import Film
 from endotwin.light.shading import F0_DIELECTRIC
 from endotwin.run.jsontext import parsed
 from endotwin.run.output import TWIN, write_folder
@@ -32,6 +33,7 @@ PARTS = ("camera", "source", "materials", "light", "response", "record")
 UNSEALED = ("source", "record", "seal")
 """Parts of ``twin.json`` that its checksum leaves out: a rendering does not depend on them."""
 MAPS = ("base_color", "roughness", "metallic")
+FILM = tuple(Film.__dataclass_fields__)
 HOLDOUT_EVERY = 8
 
 
@@ -44,6 +46,7 @@ class Materials:
         f0: specular reflectance at normal incidence, one for the whole surface.
         diffuse: ``burley`` (Disney's diffuse lobe, with retro-reflection) or ``lambert`` (that of Han & Wu
             2025).
+        film: of fluid, where one is known; None: nowhere.
     """
 
     base_color: np.ndarray
@@ -51,6 +54,19 @@ class Materials:
     metallic: np.ndarray
     f0: float = F0_DIELECTRIC
     diffuse: str = "burley"
+    film: Film | None = None
+
+    @property
+    def arrays(self) -> dict[str, np.ndarray]:
+        """All arrays by the names under which they lie on disk."""
+        film = {} if self.film is None else {f"film_{name}": value for name, value in vars(self.film).items()}
+        return {**self.per_vertex, **film}
+
+    @classmethod
+    def of(cls, arrays: dict[str, np.ndarray], constants: dict[str, float | str]) -> Materials:
+        """What has such ``arrays`` and ``constants``."""
+        film = {name: arrays.pop(f"film_{name}") for name in FILM if f"film_{name}" in arrays}
+        return cls(**arrays, **constants, film=Film(**film) if film else None)
 
     @property
     def per_vertex(self) -> dict[str, np.ndarray]:
@@ -202,7 +218,7 @@ class Twin:
 
     def _arrays(self) -> dict[str, bytes]:
         """Contents of the files of arrays, by part."""
-        fitted = {"materials": save(self.materials.per_vertex)} if self.fitted else {}
+        fitted = {"materials": save(self.materials.arrays)} if self.fitted else {}
         return {"surface": self.surface.to_bytes(), **fitted}
 
     def _document(self, arrays: dict[str, bytes]) -> dict:
@@ -238,7 +254,7 @@ class Twin:
                 surface=Surface.load(files["surface"]),
                 camera=camera_from_dict(document["camera"], path / TWIN),
                 source=Source(**document["source"]),
-                materials=Materials(**load_file(files["materials"]), **constants) if constants else None,
+                materials=Materials.of(load_file(files["materials"]), constants) if constants else None,
                 light=Light(**document["light"]) if document["light"] else None,
                 response=Response(**document["response"]) if document["response"] else None,
                 record=document["record"],
