@@ -43,7 +43,7 @@ def contents(folder: Path) -> dict[Path, bytes | None]:
 def test_a_command_that_meets_a_full_disk_says_so_and_changes_nothing(here, capfd, monkeypatch, name, after):
     file, command = COMMANDS[name]
     if "read_only" in command:  # the scores have no place, so that the profile is the first to be written
-        monkeypatch.setattr("endotwin.cli.eval._keep", lambda *_: False)
+        monkeypatch.setattr("endotwin.evaluation.keep_scores", lambda *_: False)
         command = command.replace("read_only", "twin")
     before = contents(here)
     with full_disk(here, after):
