@@ -11,12 +11,12 @@ import pyvista as pv
 from vtkmodules.vtkCommonCore import vtkLogger
 
 from endotwin.cameras import Camera
-from endotwin.errors import EndotwinError, OptionError, SequenceError, TrajectoryError
+from endotwin.errors import EndotwinError, OptionError, TrajectoryError
 from endotwin.run.output import check_picture, whole_file
 from endotwin.sequence.images import write_png
 from endotwin.sequence.poses import read_poses, write_c3vd_poses
-from endotwin.synth.trajectories.flight import FlightOptions, fly
 from endotwin.synth.trajectories.lumen import Lumen
+from endotwin.synth.trajectories.recorded import path_or_flight, recorded_poses
 from endotwin.twin import Twin, as_twin
 
 TILE = (720, 540)
@@ -169,7 +169,7 @@ class Stage:
             vtkLogger.SetStderrVerbosity(vtkLogger.VERBOSITY_ERROR)
         self._maps, self._camera, self._surface = maps, twin.camera, twin.surface
         self._within = False
-        self._poses, self._note = _recorded_poses(twin) if poses is None else (poses, "")
+        self._poses, self._note = recorded_poses(twin) if poses is None else (poses, "")
         self._frusta, self._inside = frusta, _viewpoint(twin, self._poses)
         self._plotter = pv.Plotter(off_screen=off_screen, window_size=list(tile or TILE))
         self._plotter.set_background(BACKGROUND)
@@ -377,22 +377,11 @@ def _look(shown: Map) -> dict:
     return look | ({"below_color": UNSEEN} if shown.below else {})
 
 
-def _recorded_poses(twin: Twin) -> tuple[np.ndarray | None, str]:
-    """Poses [N, 4, 4] of the twin's sequence, or None and the reason why there are none."""
-    try:
-        return twin.source.open().T_world_camera, ""
-    except SequenceError:
-        return None, f"no camera path: {Path(twin.source.path).name} is not where it was"
-
-
 def _viewpoint(twin: Twin, poses: np.ndarray | None) -> np.ndarray | None:
     """A pose [4, 4] in the lumen: a recorded one, else the first of a flight, else None."""
-    if poses is not None:
-        return poses[len(poses) // 3]
-    try:
-        return fly(FlightOptions(frames=2), Lumen(twin.surface), twin.camera, seed=0)[0][0]
-    except TrajectoryError:
-        return None
+    if poses is None:
+        poses = path_or_flight(twin)
+    return poses[len(poses) // 3] if len(poses) else None
 
 
 def _height_degrees(camera: Camera) -> float:

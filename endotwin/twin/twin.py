@@ -227,6 +227,12 @@ class Twin:
         """The mesh in pyvista, every map in ``point_data``; ``rgb`` is the base colour as displayed."""
         return meshes.to_pyvista(self)
 
+    def export(self, path: Path | str, overwrite: bool = False) -> None:
+        """Write the twin for other programs, by the suffix of ``path`` (see ``endotwin.export.FORMATS``)."""
+        from endotwin.export import export
+
+        export(self, path, overwrite)
+
     def show(self, screenshot: Path | None = None) -> None:
         """Open the inspector's window, or write its picture to ``screenshot``."""
         from endotwin.look.inspector import inspect
