@@ -18,7 +18,7 @@ import numpy as np
 from endotwin.export.appearance import Appearance, diffuse_color
 from endotwin.export.lens import as_pinhole
 from endotwin.export.ply import named, ply
-from endotwin.light.guides import log_axis
+from endotwin.light.guides import AT_LENS, log_axis
 from endotwin.light.incidence import COS_MIN
 from endotwin.light.shading import ROUGHNESS_MIN
 from endotwin.run.output import write_folder
@@ -31,7 +31,7 @@ OWN = re.compile(r"scene\.xml|tissue\.ply|profile\.pfm|poses\.txt|endotwin\.json
 FIELD_DEGREES = (60.0, 170.0)
 """Least and greatest field of a projector."""
 
-MARGIN = 1.05
+MARGIN, NEAREST_MM = 1.05, 1.0
 PROFILE_SIZE = 1024
 DIRECT, BOUNCES = 2, 24
 """Longest paths without and with light from other tissue."""
@@ -66,11 +66,12 @@ def matrix(pose: np.ndarray) -> str:
 
 
 def field_degrees(twin: Twin) -> float:
-    """Field of the projectors: wider than the twin's camera sees, as far as a projector can."""
+    """Field of the projectors: all that the twin's camera sees beyond NEAREST_MM, as far as a projector can."""
+    aside_mm = float(np.abs(np.asarray(twin.effects.guides_mm or AT_LENS)).max())
     rays = twin.camera.pixel_directions.reshape(-1, 3)
     ahead = rays[np.isfinite(rays).all(axis=1) & (rays[:, 2] > 0)]
-    widest = 2 * math.degrees(math.atan(MARGIN * float(np.abs(ahead[:, :2] / ahead[:, 2:]).max())))
-    return float(np.clip(widest, *FIELD_DEGREES))
+    reach = MARGIN * float(np.abs(ahead[:, :2] / ahead[:, 2:]).max()) + aside_mm / NEAREST_MM
+    return float(np.clip(2 * math.degrees(math.atan(reach)), *FIELD_DEGREES))
 
 
 def _mesh(twin: Twin, scale: int) -> bytes:
