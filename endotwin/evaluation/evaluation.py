@@ -297,14 +297,19 @@ def evaluate(
     return evaluation
 
 
+def error_heat(photo: np.ndarray, render: np.ndarray, valid: np.ndarray) -> np.ndarray:
+    """Mean absolute error of two pictures [H, W, 3] in [0, 1], where ``valid`` [H, W], as a picture: uint8
+    [H, W, 3], RGB, black to bright for 0 to ERROR_FULL_SCALE."""
+    error = np.abs(photo - render).mean(axis=-1) / ERROR_FULL_SCALE * valid
+    return cv2.cvtColor(cv2.applyColorMap(_eight_bit(error), cv2.COLORMAP_INFERNO), cv2.COLOR_BGR2RGB)
+
+
 def _sheet_row(held_out: _HeldOut, score: FrameScore) -> np.ndarray:
     """Photo, render and error side by side, uint8 [h, 3·SHEET_WIDTH, 3], RGB."""
-    error = np.abs(held_out.photo - held_out.render).mean(axis=-1) / ERROR_FULL_SCALE * held_out.valid
-    heat = cv2.applyColorMap(_eight_bit(error), cv2.COLORMAP_INFERNO)
     pictures = {
         f"photo {held_out.frame.name}": held_out.frame.color,
         f"render, {score.psnr:.1f} dB": _eight_bit(held_out.render),
-        f"error, 0 to {ERROR_FULL_SCALE:g}": cv2.cvtColor(heat, cv2.COLOR_BGR2RGB),
+        f"error, 0 to {ERROR_FULL_SCALE:g}": error_heat(held_out.photo, held_out.render, held_out.valid),
     }
     return np.hstack([_labelled(picture, label) for label, picture in pictures.items()])
 

@@ -66,7 +66,7 @@ def matrix(pose: np.ndarray) -> str:
 
 
 def field_degrees(twin: Twin) -> float:
-    """Field of the projectors: all that the twin's camera sees beyond NEAREST_MM, as far as a projector can."""
+    """Field of the projectors: all that the camera sees beyond NEAREST_MM, as far as a projector can."""
     aside_mm = float(np.abs(np.asarray(twin.effects.guides_mm or AT_LENS)).max())
     rays = twin.camera.pixel_directions.reshape(-1, 3)
     ahead = rays[np.isfinite(rays).all(axis=1) & (rays[:, 2] > 0)]
