@@ -2,6 +2,7 @@
 
 import os
 import shutil
+import signal
 import subprocess
 import sys
 import time
@@ -278,3 +279,11 @@ def test_a_real_window_fits_its_screen(window, screen):
     width, height = window(screen).size()
     room = [int(edge) for edge in screen.split("x")]
     assert 0.5 * min(room) < width <= room[0] and 0.5 * min(room) < height <= room[1]
+
+
+@pytest.mark.slow
+@needs_a_screen
+def test_a_window_closes_on_ctrl_c(window):
+    shown = window("800x600")
+    shown.inspector.send_signal(signal.SIGINT)
+    assert shown.inspector.wait(20) == 130

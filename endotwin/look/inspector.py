@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import signal
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from types import FrameType
 
 import numpy as np
 import pyvista as pv
@@ -29,6 +33,8 @@ SCREEN = 0.85
 
 CLOSER = 1.3
 """How much nearer than VTK would have it the mesh is shown, where it has a window of its own."""
+
+STOPPING, HEED_MS = (signal.SIGINT, signal.SIGTERM), 200
 
 OFF_SCREEN_WINDOWS = ("vtkEGLRenderWindow", "vtkOSOpenGLRenderWindow")
 
@@ -143,6 +149,37 @@ def _screen() -> tuple[int, int] | None:
     screen = None if window.GetClassName() in OFF_SCREEN_WINDOWS else tuple(window.GetScreenSize())
     plotter.close()
     return screen
+
+
+@contextmanager
+def _stoppable(plotter: pv.Plotter) -> Iterator[None]:
+    """A window that is shown in the block closes on SIGINT and SIGTERM, which then are heeded as before it.
+
+    VTK waits for events in C and takes the signals for itself: a timer gives Python its turn, and the
+    handlers are set in its first one.
+    """
+    kept = {number: signal.getsignal(number) for number in STOPPING}
+    caught: list[int] = []
+
+    def stop(number: int, _: FrameType | None) -> None:
+        caught.append(number)
+        plotter.iren.terminate_app()
+
+    def heed(*_) -> None:
+        for number, handler in kept.items():
+            if callable(handler) and signal.getsignal(number) is not stop:
+                signal.signal(number, stop)
+
+    plotter.iren.initialize()
+    plotter.iren.interactor.AddObserver("TimerEvent", heed)
+    plotter.iren.interactor.CreateRepeatingTimer(HEED_MS)
+    try:
+        yield
+    finally:
+        for number, handler in kept.items():
+            signal.signal(number, handler)
+    for number in caught[:1]:
+        kept[number](number, None)
 
 
 def _fitting(size: tuple[int, int], screen: tuple[int, int]) -> tuple[int, int]:
@@ -332,7 +369,8 @@ class Stage:
             frustum = _frustum(self._camera, np.eye(4), 0.3 * scope.usual_mm)
             marker = plotter.add_mesh(frustum, color=INK, line_width=3, lighting=False, reset_camera=False)
             ScopePane(plotter, scope, marker, keyframes.absolute().parent, say)
-        plotter.show(title="endotwin")
+        with _stoppable(plotter):
+            plotter.show(title="endotwin")
 
     def contact_sheet(self, names: list[str], inside: bool = True) -> np.ndarray:
         """Uint8 [H, W, 3]: a column a map, outside above ``inside``, where there is a viewpoint.

@@ -3,6 +3,7 @@ sliders, switches."""
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -25,7 +26,7 @@ STEP = 0.04
 
 TURN, TURN_PX = 0.06, 0.004
 CLICK_PX = 4
-REST_MS = 250
+REST_S = 0.25
 FIRST = 100.0
 """Priority of observers: before those of VTK, which they stop."""
 
@@ -54,7 +55,7 @@ class ScopePane:
         self._notes: list[str] | None = None
         self._drag: tuple[int, int] | None = None
         self._moved_px = 0
-        self._resting = True
+        self._moved_at: float | None = None
         self._prices: dict[str, float] = {}
         plotter.subplot(0, 1)
         self._plane = plotter.add_mesh(
@@ -79,9 +80,7 @@ class ScopePane:
         self._renderer.camera.parallel_scale = 0.5
         self._marker.user_matrix = self._scope.pose
         self._plotter.render()
-        if quick:
-            self._resting = False
-            self._plotter.iren.interactor.CreateOneShotTimer(REST_MS)
+        self._moved_at = time.monotonic() if quick else None
 
     def _size(self) -> tuple[int, int]:
         width, height = self._plotter.window_size
@@ -253,7 +252,7 @@ class ScopePane:
         return action is not None
 
     def _rest(self) -> bool:
-        if not self._resting and self._drag is None:
-            self._resting = True
+        """Draw the whole view once nothing has moved for a while; called by the window's timer."""
+        if self._moved_at is not None and self._drag is None and time.monotonic() - self._moved_at > REST_S:
             self.draw()
         return False

@@ -182,6 +182,7 @@ function fly() {
 (async () => {
   try {
     if (!gl) throw Error("this browser has no WebGL 2");
+    document.getElementById("panel").open = innerWidth > 700;
     sliders();
     controls();
     await load();
