@@ -21,9 +21,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from endotwin.cameras.perspective import as_pinhole
 from endotwin.evaluation.metrics import psnr
 from endotwin.export import FORMATS
-from endotwin.export.lens import as_pinhole
 from endotwin.export.mitsuba import matrix
 from endotwin.twin import Twin
 

@@ -15,8 +15,8 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from endotwin.cameras.perspective import as_pinhole, height_degrees
 from endotwin.export.appearance import Appearance
-from endotwin.export.lens import as_pinhole, height_degrees
 from endotwin.export.textured import Textured, textured
 from endotwin.light.shading import F0_DIELECTRIC, ROUGHNESS_MIN
 from endotwin.run.output import whole_file

@@ -18,8 +18,8 @@ from string import Template
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from endotwin.cameras.perspective import as_pinhole
 from endotwin.export.appearance import Appearance, diffuse_color
-from endotwin.export.lens import as_pinhole
 from endotwin.run.output import whole_file
 from endotwin.synth.trajectories.recorded import path_or_flight
 from endotwin.twin import Twin

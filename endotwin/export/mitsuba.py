@@ -15,8 +15,8 @@ from xml.etree import ElementTree as xml
 
 import numpy as np
 
+from endotwin.cameras.perspective import as_pinhole
 from endotwin.export.appearance import Appearance, diffuse_color
-from endotwin.export.lens import as_pinhole
 from endotwin.export.ply import named, ply
 from endotwin.light.guides import AT_LENS, log_axis
 from endotwin.light.incidence import COS_MIN

@@ -16,8 +16,8 @@ import cv2
 import numpy as np
 from scipy.spatial import cKDTree
 
+from endotwin.cameras.perspective import as_pinhole
 from endotwin.export.appearance import diffuse_color
-from endotwin.export.lens import as_pinhole
 from endotwin.fusion._open3d import o3d
 from endotwin.surface import Surface
 from endotwin.surface.casting import Caster, Correspondences

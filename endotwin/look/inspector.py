@@ -15,6 +15,7 @@ import pyvista as pv
 from vtkmodules.vtkCommonCore import vtkLogger
 
 from endotwin.cameras import Camera
+from endotwin.cameras.perspective import height_degrees
 from endotwin.errors import EndotwinError, OptionError, TrajectoryError
 from endotwin.look.scope import Scope
 from endotwin.look.scopepane import PANES, ScopePane
@@ -296,7 +297,7 @@ class Stage:
             return
         self._show_within(True)
         self._plotter.camera_position = [pose[:3, 3], pose[:3, 3] + pose[:3, 2], -pose[:3, 1]]
-        self._plotter.camera.view_angle = _height_degrees(self._camera)
+        self._plotter.camera.view_angle = height_degrees(self._camera)
         self._plotter.camera.clipping_range = (0.1, 1000.0)
         self._show_path(False)
 
@@ -450,17 +451,9 @@ def _viewpoint(twin: Twin, poses: np.ndarray | None) -> np.ndarray | None:
     return poses[len(poses) // 3] if len(poses) else None
 
 
-def _height_degrees(camera: Camera) -> float:
-    """Angle between the top and the bottom of the picture, kept where a perspective view makes sense."""
-    middle = (camera.width - 1) / 2
-    top, bottom = camera.directions(np.array([[middle, 0.0], [middle, camera.height - 1.0]]))
-    angle = np.degrees(np.arccos(np.clip(top @ bottom, -1, 1)))
-    return float(np.clip(np.nan_to_num(angle, nan=100.0), 40.0, 100.0))
-
-
 def _frustum(camera: Camera, pose: np.ndarray, depth_mm: float) -> pv.PolyData:
     """The pyramid that a perspective camera of the same height sees, as lines, ``depth_mm`` long."""
-    half = np.tan(np.radians(_height_degrees(camera)) / 2)
+    half = np.tan(np.radians(height_degrees(camera)) / 2)
     wide = half * camera.width / camera.height
     corners = np.array([[-wide, -half, 1], [wide, -half, 1], [wide, half, 1], [-wide, half, 1]]) * depth_mm
     points = np.vstack([np.zeros(3), corners]) @ pose[:3, :3].T + pose[:3, 3]

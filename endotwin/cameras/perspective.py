@@ -6,7 +6,8 @@ import math
 
 import numpy as np
 
-from endotwin.cameras import Camera, Pinhole
+from endotwin.cameras.base import Camera
+from endotwin.cameras.pinhole import Pinhole
 
 WIDEST_DEGREES = 100.0
 """Height of the field that a perspective view of a wider lens has."""
