@@ -21,6 +21,9 @@ COMMANDS = {
     "synth of tars": ("new", "synth twin --trajectory jitter:frames=2 --layout webdataset -o new"),
     "preview": ("new.png", "synth twin --trajectory jitter:frames=2 --preview new.png"),
     "inspect": ("new.png", "inspect twin --screenshot new.png --map base_color"),
+    "export of one file": ("new.ply", "export twin new.ply"),
+    "export of several": ("new", "export twin new.obj"),
+    "export of a folder": ("new.mitsuba", "export twin new.mitsuba"),
     "tradeoff": ("new", "tradeoff tube -o new --rungs draft --repeats 1"),
 }
 

@@ -6,6 +6,7 @@ The pictures and the material are named after the mesh, which is written last.
 from __future__ import annotations
 
 import io
+from contextlib import ExitStack
 from pathlib import Path
 
 import numpy as np
@@ -49,9 +50,9 @@ def write_obj(twin: Twin, path: Path, overwrite: bool = False) -> None:
     contents = {names[part]: png(picture) for part, picture in pictures.items()}
     contents[path.with_suffix(".mtl")] = MATERIAL.format(stem=path.stem, **look.to_dict()).encode()
     contents[path] = _mesh(mesh, twin.surface.origin_mm, path.stem)
-    for file, content in contents.items():
-        with whole_file(file, overwrite) as beside:
-            beside.write_bytes(content)
+    with ExitStack() as opened:  # every file is written before the first one is moved to its place
+        for file, content in reversed(contents.items()):
+            opened.enter_context(whole_file(file, overwrite)).write_bytes(content)
 
 
 def _mesh(mesh: Textured, origin_mm: np.ndarray, stem: str) -> bytes:
