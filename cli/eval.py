@@ -3,20 +3,13 @@
 from __future__ import annotations
 
 import json as json_format
-import logging
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 from endotwin.cli import console
 
-from endotwin.errors import OutputError
-from endotwin.run.output import TWIN, check_free, check_picture
-
-if TYPE_CHECKING:
-    from endotwin.twin import Twin
-
-logger = logging.getLogger("endotwin")
+from endotwin.run.output import check_picture
 
 
 def evaluate(
@@ -52,7 +45,7 @@ def evaluate(
         check_picture(sheet, overwrite)
     with console.command("eval", profile) as run:
         with run.stage("import"):
-            from endotwin.evaluation import evaluate
+            from endotwin.evaluation import evaluate, keep_scores
             from endotwin.twin import Twin
         with run.stage("load"):
             twin = Twin.load(twin_folder)
@@ -61,22 +54,7 @@ def evaluate(
             evaluation = evaluate(scored, sheet, run.progress, overwrite)
         print(json_format.dumps(evaluation.to_dict()) if json else evaluation)
         with run.stage("write"):
-            kept = _keep(evaluation.to_dict(), twin, twin_folder)
+            kept = keep_scores(evaluation.to_dict(), twin, twin_folder)
     written = [f"the scores to {twin_folder}"] * kept + [f"the contact sheet to {sheet}"] * bool(sheet)
     if written and not json:
         print("wrote", " and ".join(written))
-
-
-def _keep(scores: dict, twin: Twin, folder: Path) -> bool:
-    """Keep the scores in the twin's folder, unless another twin is there by now or one may only read it."""
-    try:
-        check_free(folder, True, TWIN)
-    except OutputError as error:
-        logger.warning("The scores are not kept in the twin: %s", error)
-        return False
-    current = type(twin).load(folder)
-    if current.seal != twin.seal:
-        logger.warning("The scores are not kept: %s was replaced while it was scored", folder)
-        return False
-    current.with_record(eval=scores).save(folder, overwrite=True)
-    return True

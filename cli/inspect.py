@@ -21,7 +21,7 @@ def inspect(
         str | None,
         typer.Option(
             metavar="NAME",
-            help="Show base_color, roughness, metallic, coverage or normals.",
+            help="Show base_color, roughness, metallic, coverage or normals; scope: the view through it.",
             show_default="all",
         ),
     ] = None,
@@ -34,7 +34,9 @@ def inspect(
     overwrite: console.Overwrite = False,
     profile: console.Profile = None,
 ) -> None:
-    """Show TWIN's mesh with its maps and the camera path; a key steps through the maps.
+    """Show TWIN's mesh with its maps and the camera path, and fly a scope through it.
+
+    Keys and sliders are told in the window and in docs/inspector.md.
 
     Example: endotwin inspect twin --screenshot twin.png --map roughness
     """

@@ -9,6 +9,7 @@ import typer
 from endotwin.cli.check import check
 from endotwin.cli.effects import effects
 from endotwin.cli.eval import evaluate
+from endotwin.cli.export import export
 from endotwin.cli.fit import fit
 from endotwin.cli.fuse import fuse
 from endotwin.cli.inspect import inspect
@@ -32,6 +33,7 @@ for name, function in {
     "eval": evaluate,
     "synth": synth,
     "inspect": inspect,
+    "export": export,
     "effects": effects,
     "check": check,
     "selfcheck": selfcheck,

@@ -16,7 +16,11 @@ RANK = {room: rank for rank, storey in enumerate(STOREYS) for room in re.findall
 
 EFFECTS_MAY_IMPORT = {"errors", "run", "cameras", "sequence", "effects"}
 
-EXCEPTIONS = {("twin.twin", "look.inspector"): "Twin.show() opens the window in which a twin is looked at"}
+EXCEPTIONS = {
+    ("twin.twin", "look.inspector"): "Twin.show() opens the window in which a twin is looked at",
+    ("twin.twin", "export.export"): "Twin.export() writes it for other programs",
+    ("twin.twin", "render"): "Twin.render() is how one asks a twin for a view",
+}
 """Imports that point upwards, and why."""
 
 

@@ -173,7 +173,7 @@ def test_help_is_instant_because_nothing_slow_is_imported():
     assert all(command in done.stdout for command in ("fuse", "fit", "eval", "synth", "tradeoff"))
 
 
-@pytest.mark.parametrize("command", ["fuse", "fit", "eval", "synth", "inspect", "tradeoff"])
+@pytest.mark.parametrize("command", ["fuse", "fit", "eval", "synth", "inspect", "export", "tradeoff"])
 def test_every_command_explains_itself_with_an_example(endotwin, command):
     code, out, _ = endotwin(command, "--help")
     assert code == 0 and f"endotwin {command}" in out and "Example" in out
@@ -479,6 +479,14 @@ def test_a_twin_from_a_newer_version(fails, made, tmp_path, command):
 @pytest.mark.parametrize("command", ["fit", "eval", "inspect"])
 def test_a_folder_that_is_no_twin(fails, made, command):
     assert "not a twin" in fails(command, made / "tube")
+
+
+def test_an_export_without_a_known_suffix_lists_those_that_there_are(fails, made, tmp_path):
+    assert all(
+        suffix in fails("export", made / "twin", tmp_path / "colon.fbx") for suffix in (".glb", ".html")
+    )
+    assert "not a twin" in fails("export", made / "tube", tmp_path / "colon.ply")
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_damaged_twin(fails, made, tmp_path):

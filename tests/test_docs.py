@@ -1,5 +1,6 @@
 """The pages say what the code does, and every link between them leads somewhere."""
 
+import doctest
 import importlib.util
 import re
 from pathlib import Path
@@ -26,3 +27,14 @@ def test_every_link_leads_somewhere(page):
 @pytest.mark.parametrize("page", sorted((ROOT / "docs").glob("*.md")), ids=lambda page: page.name)
 def test_every_page_can_be_reached_from_the_readme(page):
     assert f"docs/{page.name}" in (ROOT / "README.md").read_text(encoding="utf-8")
+
+
+@pytest.mark.slow
+def test_the_session_of_the_python_page_runs_as_it_stands(tmp_path, monkeypatch):
+    monkeypatch.chdir(ROOT)
+    text = (ROOT / "docs" / "python.md").read_text(encoding="utf-8").replace("OUT/", f"{tmp_path}/")
+    session = doctest.DocTestParser().get_doctest(text.replace("```", ""), {}, "python.md", None, 0)
+    assert len(session.examples) > 10
+    told = []
+    doctest.DocTestRunner(optionflags=doctest.ELLIPSIS).run(session, out=told.append)
+    assert "".join(told) == ""

@@ -21,6 +21,9 @@ COMMANDS = {
     "synth of tars": ("new", "synth twin --trajectory jitter:frames=2 --layout webdataset -o new"),
     "preview": ("new.png", "synth twin --trajectory jitter:frames=2 --preview new.png"),
     "inspect": ("new.png", "inspect twin --screenshot new.png --map base_color"),
+    "export of one file": ("new.ply", "export twin new.ply"),
+    "export of several": ("new", "export twin new.obj"),
+    "export of a folder": ("new.mitsuba", "export twin new.mitsuba"),
     "tradeoff": ("new", "tradeoff tube -o new --rungs draft --repeats 1"),
 }
 
@@ -43,7 +46,7 @@ def contents(folder: Path) -> dict[Path, bytes | None]:
 def test_a_command_that_meets_a_full_disk_says_so_and_changes_nothing(here, capfd, monkeypatch, name, after):
     file, command = COMMANDS[name]
     if "read_only" in command:  # the scores have no place, so that the profile is the first to be written
-        monkeypatch.setattr("endotwin.cli.eval._keep", lambda *_: False)
+        monkeypatch.setattr("endotwin.evaluation.keep_scores", lambda *_: False)
         command = command.replace("read_only", "twin")
     before = contents(here)
     with full_disk(here, after):

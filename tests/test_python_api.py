@@ -1,5 +1,7 @@
 """The library in other hands: what makes sense is taken, and the rest is refused by a typed sentence."""
 
+import pickle
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +11,7 @@ import tube_twin
 
 import endotwin
 from endotwin.errors import EndotwinError, OptionError, TrajectoryError, TwinError
+from endotwin.surface.silhouettes import discontinuities
 
 
 @pytest.fixture(scope="module")
@@ -29,6 +32,68 @@ def test_a_pose_may_be_a_list(twin):
     pose = tube_twin.pose(0.5)
     renderer = endotwin.Renderer(twin)
     np.testing.assert_array_equal(renderer.view(pose.tolist()).color, renderer.view(pose).color)
+
+
+def test_a_render_is_the_renderers_view_through_any_camera(twin):
+    pose = tube_twin.pose(0.5)
+    for camera in (None, twin.camera.scaled(0.5), twin.camera):
+        mine, its = twin.render(pose, camera), endotwin.Renderer(twin, camera).view(pose)
+        for name in ("color", "radiance", "depth_mm", "normals", "mask"):
+            np.testing.assert_array_equal(getattr(mine, name), getattr(its, name))
+    assert mine.color.shape == (72, 96, 3) and mine.depth_mm.shape == mine.mask.shape == (72, 96)
+
+
+def test_the_albedo_of_a_view_is_the_base_colour_that_lambert_shows(twin):
+    matte = replace(
+        twin,
+        materials=replace(twin.materials, f0=0.0, diffuse="lambert", metallic=0 * twin.materials.metallic),
+    )
+    view = matte.render(tube_twin.pose(0.5))
+    inner = ~discontinuities(np.nan_to_num(view.depth_mm)) & view.mask
+    ratio = view.radiance[inner] / view.albedo[inner]
+    np.testing.assert_allclose(ratio, ratio[:, :1].repeat(3, axis=1), rtol=1e-2)
+    assert view.albedo[~view.mask].max(initial=0) == 0
+
+
+@pytest.mark.parametrize("of", ["to_trimesh", "to_open3d", "to_pyvista"])
+def test_meshes_of_other_libraries_have_every_vertex_and_every_map(twin, of):
+    mesh = getattr(twin, of)()
+    if of == "to_trimesh":
+        points, triangles, normals, maps = (
+            mesh.vertices,
+            mesh.faces,
+            mesh.vertex_normals,
+            mesh.vertex_attributes,
+        )
+    elif of == "to_open3d":
+        maps = {name: mesh.vertex[name].numpy().squeeze() for name in mesh.vertex}
+        points, normals, triangles = maps["positions"], maps["normals"], mesh.triangle.indices.numpy()
+    else:
+        points, triangles, maps = mesh.points, mesh.regular_faces, dict(mesh.point_data)
+        normals = maps["normals"]
+    surface = twin.surface
+    np.testing.assert_allclose(points, surface.vertices_mm + surface.origin_mm, atol=1e-5)
+    np.testing.assert_array_equal(triangles, surface.triangles)
+    np.testing.assert_allclose(normals, surface.normals, atol=1e-6)
+    known = {**twin.materials.per_vertex, "seen_by": surface.seen_by, "nearest_mm": surface.nearest_mm}
+    for name, values in known.items():
+        np.testing.assert_array_equal(maps[name], values)
+
+
+def test_a_twin_that_has_been_rendered_can_go_to_another_process(twin):
+    pose = tube_twin.pose(0.5)
+    seen = twin.render(pose).color
+    np.testing.assert_array_equal(pickle.loads(pickle.dumps(twin)).render(pose).color, seen)
+
+
+def test_scores_are_kept_in_the_folder_that_was_named_and_handed_over_for_a_twin(made, tmp_path):
+    fitted = endotwin.fit_twin(made / "twin", budget_s=1)
+    fitted.save(tmp_path / "twin")
+    evaluation = endotwin.evaluate(tmp_path / "twin")
+    kept = endotwin.Twin.load(tmp_path / "twin").record["eval"]
+    assert kept == evaluation.to_dict() == evaluation.twin.record["eval"]
+    assert f"held out: {evaluation.psnr:.2f} dB" in str(evaluation.twin)
+    assert "eval" not in fitted.record and "held out" not in str(fitted)
 
 
 @pytest.mark.parametrize(

@@ -27,6 +27,7 @@ import numpy as np
 
 from endotwin.errors import TwinError
 from endotwin.evaluation import metrics
+from endotwin.evaluation.kept import keep_scores
 from endotwin.light import shading
 from endotwin.render import Renderer
 from endotwin.run.output import check_picture
@@ -82,13 +83,26 @@ class Evaluation:
     """Scores of a twin on its held-out frames; a mean score is the mean of the frames' scores.
 
     Attributes:
-        frames: one score a held-out frame. gamma, light: what the fit found. geometry: the twin's protocol.
+        frames: one score a held-out frame. scored: the twin that they are of.
     """
 
     frames: tuple[FrameScore, ...]
-    gamma: float
-    light: Light
-    geometry: str
+    scored: Twin
+
+    @property
+    def twin(self) -> Twin:
+        """The twin with these scores in its record."""
+        return self.scored.with_record(eval=self.to_dict())
+
+    @property
+    def gamma(self) -> float:
+        """What the fit found of the response."""
+        return self.scored.response.gamma
+
+    @property
+    def light(self) -> Light:
+        """What the fit found of the light."""
+        return self.scored.light
 
     def mean(self, score: str) -> float:
         """Mean of a score, such as ``psnr_covered``, over the frames that have it; NaN where none has."""
@@ -146,7 +160,7 @@ class Evaluation:
         widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
         lines = ["  ".join(map(str.rjust, row, widths)) for row in rows]
         light = f"L0 {self.light.L0:.4g}, n {self.light.n:.3f}, q {self.light.q:.3f}"
-        lines.append(f"{light}; γ {self.gamma:.4f}; geometry {self.geometry}")
+        lines.append(f"{light}; γ {self.gamma:.4f}; geometry {self.scored.source.geometry}")
         return "\n".join(lines)
 
 
@@ -247,7 +261,7 @@ def evaluate(
     """Score a fitted twin on the frames that were held out of its fit.
 
     Args:
-        twin: or its folder.
+        twin: or its folder, in which the scores then are kept.
         sheet: PNG file to write a contact sheet to, one row photo | render | error a frame.
         progress: called with (label, done, total).
         overwrite: whether ``sheet`` may exist.
@@ -257,6 +271,7 @@ def evaluate(
         SequenceError: the twin's sequence has moved.
         OutputError: ``sheet`` exists or cannot be written.
     """
+    folder = None if isinstance(twin, Twin) else twin
     twin = as_twin(twin)
     if sheet is not None:
         check_picture(sheet, overwrite)
@@ -271,23 +286,30 @@ def evaluate(
         )
     if sheet is not None:
         write_png(Path(sheet), np.vstack(rows), overwrite)
-    evaluation = Evaluation(tuple(scores), twin.response.gamma, twin.light, twin.source.geometry)
+    evaluation = Evaluation(tuple(scores), twin)
     if evaluation.psnr < POOR_DB:
         logger.warning(
             "the twin does not look like its photos (%.1f dB); 'endotwin check %s' looks for the cause",
             *(evaluation.psnr, twin.source.path),
         )
+    if folder is not None:
+        keep_scores(evaluation.to_dict(), twin, Path(folder))
     return evaluation
+
+
+def error_heat(photo: np.ndarray, render: np.ndarray, valid: np.ndarray) -> np.ndarray:
+    """Mean absolute error of two pictures [H, W, 3] in [0, 1], where ``valid`` [H, W], as a picture: uint8
+    [H, W, 3], RGB, black to bright for 0 to ERROR_FULL_SCALE."""
+    error = np.abs(photo - render).mean(axis=-1) / ERROR_FULL_SCALE * valid
+    return cv2.cvtColor(cv2.applyColorMap(_eight_bit(error), cv2.COLORMAP_INFERNO), cv2.COLOR_BGR2RGB)
 
 
 def _sheet_row(held_out: _HeldOut, score: FrameScore) -> np.ndarray:
     """Photo, render and error side by side, uint8 [h, 3·SHEET_WIDTH, 3], RGB."""
-    error = np.abs(held_out.photo - held_out.render).mean(axis=-1) / ERROR_FULL_SCALE * held_out.valid
-    heat = cv2.applyColorMap(_eight_bit(error), cv2.COLORMAP_INFERNO)
     pictures = {
         f"photo {held_out.frame.name}": held_out.frame.color,
         f"render, {score.psnr:.1f} dB": _eight_bit(held_out.render),
-        f"error, 0 to {ERROR_FULL_SCALE:g}": cv2.cvtColor(heat, cv2.COLOR_BGR2RGB),
+        f"error, 0 to {ERROR_FULL_SCALE:g}": error_heat(held_out.photo, held_out.render, held_out.valid),
     }
     return np.hstack([_labelled(picture, label) for label, picture in pictures.items()])
 

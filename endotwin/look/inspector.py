@@ -2,21 +2,28 @@
 
 from __future__ import annotations
 
+import signal
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from types import FrameType
 
 import numpy as np
 import pyvista as pv
 from vtkmodules.vtkCommonCore import vtkLogger
 
 from endotwin.cameras import Camera
-from endotwin.errors import EndotwinError, OptionError, SequenceError, TrajectoryError
+from endotwin.cameras.perspective import height_degrees
+from endotwin.errors import EndotwinError, OptionError, TrajectoryError
+from endotwin.look.scope import Scope
+from endotwin.look.scopepane import PANES, ScopePane
 from endotwin.run.output import check_picture, whole_file
 from endotwin.sequence.images import write_png
 from endotwin.sequence.poses import read_poses, write_c3vd_poses
-from endotwin.synth.trajectories.flight import FlightOptions, fly
 from endotwin.synth.trajectories.lumen import Lumen
+from endotwin.synth.trajectories.recorded import path_or_flight, recorded_poses
 from endotwin.twin import Twin, as_twin
 
 TILE = (720, 540)
@@ -25,9 +32,17 @@ TILE = (720, 540)
 SCREEN = 0.85
 """Share of the screen that a window takes at most: the rest is for its frame and for panels."""
 
+CLOSER = 1.3
+"""How much nearer than VTK would have it the mesh is shown, where it has a window of its own."""
+
+STOPPING, HEED_MS = (signal.SIGINT, signal.SIGTERM), 200
+
 OFF_SCREEN_WINDOWS = ("vtkEGLRenderWindow", "vtkOSOpenGLRenderWindow")
 
-KEYS = "m, space: next map   o: outside   i: inside   c: camera path   k: save keyframe   q: quit"
+SCOPE = "scope"
+"""Beside the maps, what a picture can show: the view through the scope."""
+
+KEYS = ("m, space: next map   o: outside   i: inside", "c: camera path   k: save keyframe   q: quit")
 FRUSTA = 8
 SEAM = 1 / 120
 """Width of the mesh's edges, as seen from inside, in widths of the picture: two pixels of a photo of 240."""
@@ -88,11 +103,15 @@ def inspect(
 ) -> None:
     """Open a window on ``twin``, or write a contact sheet of its maps without a display.
 
+    The window shows the mesh from outside and, once the twin is fitted, the view through the scope: flown by
+    mouse and keys, beside the photos, under any light (``Scope``).
+
     Args:
         twin: or its folder.
         screenshot: PNG file to write instead of opening a window.
         map: ``base_color``, ``roughness``, ``metallic``, ``coverage`` or ``normals``: the window's first, the
-            sheet's only one. All maps unless given.
+            sheet's only one; ``scope``: the window's pane with the view through the scope. All maps unless
+            given.
         overwrite: whether ``screenshot`` may exist.
         keyframes: pose file that the key k adds the window's view to, for the trajectory ``spline:FILE``.
 
@@ -102,17 +121,23 @@ def inspect(
     """
     twin = as_twin(twin)
     maps = twin_maps(twin)
-    if map is not None and map not in maps:
+    named = [*maps, *([SCOPE] if twin.fitted else [])]
+    if map is not None and map not in named:
         reason = "" if twin.fitted else " (it is not fitted yet)"
-        raise OptionError(f"the twin has no map {map!r}{reason}; choose one of {', '.join(maps)}")
+        raise OptionError(f"the twin has no map {map!r}{reason}; choose one of {', '.join(named)}")
     if screenshot is None:
         screen = _screen()
         if screen is None:
             raise OptionError("there is no display to open a window on; name a PNG file as screenshot")
-        stage = Stage(twin, maps, off_screen=False, tile=_fitting((2 * TILE[0], 2 * TILE[1]), screen))
-        stage.open_window(map or next(iter(maps)), Path(keyframes))
+        scope = Scope(twin) if twin.fitted else None
+        size = _fitting((2 * TILE[0], 2 * TILE[1]), screen)
+        stage = Stage(twin, maps, off_screen=False, tile=size, panes=PANES if scope else None)
+        stage.open_window(map if map in maps else next(iter(maps)), Path(keyframes), scope)
         return
     check_picture(Path(screenshot), overwrite)
+    if map == SCOPE:
+        write_png(Path(screenshot), Scope(twin).picture((TILE[0], 2 * TILE[1])), overwrite)
+        return
     sheet = Stage(twin, maps, off_screen=True).contact_sheet([map] if map else list(maps))
     write_png(Path(screenshot), sheet, overwrite)
 
@@ -125,6 +150,37 @@ def _screen() -> tuple[int, int] | None:
     screen = None if window.GetClassName() in OFF_SCREEN_WINDOWS else tuple(window.GetScreenSize())
     plotter.close()
     return screen
+
+
+@contextmanager
+def _stoppable(plotter: pv.Plotter) -> Iterator[None]:
+    """A window that is shown in the block closes on SIGINT and SIGTERM, which then are heeded as before it.
+
+    VTK waits for events in C and takes the signals for itself: a timer gives Python its turn, and the
+    handlers are set in its first one.
+    """
+    kept = {number: signal.getsignal(number) for number in STOPPING}
+    caught: list[int] = []
+
+    def stop(number: int, _: FrameType | None) -> None:
+        caught.append(number)
+        plotter.iren.terminate_app()
+
+    def heed(*_) -> None:
+        for number, handler in kept.items():
+            if callable(handler) and signal.getsignal(number) is not stop:
+                signal.signal(number, stop)
+
+    plotter.iren.initialize()
+    plotter.iren.interactor.AddObserver("TimerEvent", heed)
+    plotter.iren.interactor.CreateRepeatingTimer(HEED_MS)
+    try:
+        yield
+    finally:
+        for number, handler in kept.items():
+            signal.signal(number, handler)
+    for number in caught[:1]:
+        kept[number](number, None)
 
 
 def _fitting(size: tuple[int, int], screen: tuple[int, int]) -> tuple[int, int]:
@@ -153,7 +209,8 @@ class Stage:
 
     Args:
         poses: [N, 4, 4] to draw; those of the twin's sequence unless given. frusta: how many of them to draw.
-        tile: size of the picture or the window, width and height.
+        tile: size of the picture or the window, width and height. panes: how it is divided; the first is the
+            mesh's.
     """
 
     def __init__(
@@ -164,15 +221,16 @@ class Stage:
         poses: np.ndarray | None = None,
         frusta: int = FRUSTA,
         tile: tuple[int, int] | None = None,
+        panes: dict | None = None,
     ):
         if off_screen:  # VTK warns of the display that is not needed
             vtkLogger.SetStderrVerbosity(vtkLogger.VERBOSITY_ERROR)
         self._maps, self._camera, self._surface = maps, twin.camera, twin.surface
         self._within = False
-        self._poses, self._note = _recorded_poses(twin) if poses is None else (poses, "")
+        self._poses, self._note = recorded_poses(twin) if poses is None else (poses, "")
         self._frusta, self._inside = frusta, _viewpoint(twin, self._poses)
-        self._plotter = pv.Plotter(off_screen=off_screen, window_size=list(tile or TILE))
-        self._plotter.set_background(BACKGROUND)
+        self._plotter = pv.Plotter(off_screen=off_screen, window_size=list(tile or TILE), **(panes or {}))
+        self._plotter.set_background(BACKGROUND, all_renderers=True)
         self._plotter.enable_anti_aliasing("ssaa")
         surface = twin.surface
         faces = np.column_stack([np.full(len(surface.triangles), 3, np.int32), surface.triangles])
@@ -230,7 +288,7 @@ class Stage:
         self._plotter.camera_position = [middle + 1000 * axes[2], middle, axes[1]]
         self._show_path(True)
         self._plotter.reset_camera()
-        self._plotter.camera.zoom(1.3)
+        self._plotter.camera.zoom(CLOSER if len(self._plotter.renderers) == 1 else 1.0)
 
     def look_from_inside(self) -> None:
         """From a pose in the lumen through the height of the twin's camera."""
@@ -239,7 +297,7 @@ class Stage:
             return
         self._show_within(True)
         self._plotter.camera_position = [pose[:3, 3], pose[:3, 3] + pose[:3, 2], -pose[:3, 1]]
-        self._plotter.camera.view_angle = _height_degrees(self._camera)
+        self._plotter.camera.view_angle = height_degrees(self._camera)
         self._plotter.camera.clipping_range = (0.1, 1000.0)
         self._show_path(False)
 
@@ -254,13 +312,13 @@ class Stage:
         pose[:3] = np.stack([right, np.cross(ahead, right), ahead, camera.position], axis=1)
         return pose
 
-    def save_keyframe(self, path: Path) -> int:
-        """Add the view to the poses in the file ``path``; the number of poses that it has then.
+    def save_keyframe(self, path: Path, pose: np.ndarray | None = None) -> int:
+        """Add the view, or ``pose`` [4, 4], to the poses in the file ``path``; the number that it has then.
 
         Raises:
             TrajectoryError: the file exists and is no pose file, or the view is none from within the lumen.
         """
-        poses = self.view_pose()[None]
+        poses = (self.view_pose() if pose is None else pose)[None]
         if not self._lumen.outlook(self._camera, poses).inside[0]:
             raise TrajectoryError("the view is not from within the lumen, looking at its wall; press i first")
         if path.exists():
@@ -273,8 +331,9 @@ class Stage:
     def _lumen(self) -> Lumen:
         return Lumen(self._surface)
 
-    def open_window(self, name: str, keyframes: Path) -> None:
-        """Show the window until it is closed; the key k adds its view to the pose file ``keyframes``."""
+    def open_window(self, name: str, keyframes: Path, scope: Scope | None = None) -> None:
+        """Show the window until it is closed; the key k adds its view, that of the ``scope`` if there is one,
+        to the pose file ``keyframes``."""
         plotter, names = self._plotter, list(self._maps)
 
         def next_map() -> None:
@@ -285,13 +344,16 @@ class Stage:
             action()
             plotter.render()
 
+        def say(done: str) -> None:
+            self._caption(done, "keyframe", (12, 60), 9)
+            plotter.render()
+
         def keep_view() -> None:
             try:
-                done = f"keyframe {self.save_keyframe(keyframes)} saved to {keyframes}"
+                done = f"keyframe {self.save_keyframe(keyframes, scope and scope.pose)} saved to {keyframes}"
             except (EndotwinError, OSError) as error:
                 done = f"no keyframe saved: {error}"
-            self._caption(done, "keyframe", (12, 42), 9)
-            plotter.render()
+            say(done)
 
         plotter.add_key_event("k", keep_view)
         for key in ("m", "space"):
@@ -299,12 +361,17 @@ class Stage:
         plotter.add_key_event("o", lambda: rendered(self.look_from_outside))
         plotter.add_key_event("i", lambda: rendered(self.look_from_inside))
         plotter.add_key_event("c", lambda: rendered(lambda: self._show_path(not self._path_visible)))
-        self._caption(KEYS, "keys", (12, 12), 9)
+        self._caption(("   " if scope is None else "\n").join(KEYS), "keys", (12, 12), 9)
         if self._note:
             self._caption(self._note, "note", (12, self._plotter.window_size[1] - 66), 9)
         self.show_map(name)
         self.look_from_outside()
-        plotter.show(title="endotwin")
+        if scope is not None:
+            frustum = _frustum(self._camera, np.eye(4), 0.3 * scope.usual_mm)
+            marker = plotter.add_mesh(frustum, color=INK, line_width=3, lighting=False, reset_camera=False)
+            ScopePane(plotter, scope, marker, keyframes.absolute().parent, say)
+        with _stoppable(plotter):
+            plotter.show(title="endotwin")
 
     def contact_sheet(self, names: list[str], inside: bool = True) -> np.ndarray:
         """Uint8 [H, W, 3]: a column a map, outside above ``inside``, where there is a viewpoint.
@@ -377,35 +444,16 @@ def _look(shown: Map) -> dict:
     return look | ({"below_color": UNSEEN} if shown.below else {})
 
 
-def _recorded_poses(twin: Twin) -> tuple[np.ndarray | None, str]:
-    """Poses [N, 4, 4] of the twin's sequence, or None and the reason why there are none."""
-    try:
-        return twin.source.open().T_world_camera, ""
-    except SequenceError:
-        return None, f"no camera path: {Path(twin.source.path).name} is not where it was"
-
-
 def _viewpoint(twin: Twin, poses: np.ndarray | None) -> np.ndarray | None:
     """A pose [4, 4] in the lumen: a recorded one, else the first of a flight, else None."""
-    if poses is not None:
-        return poses[len(poses) // 3]
-    try:
-        return fly(FlightOptions(frames=2), Lumen(twin.surface), twin.camera, seed=0)[0][0]
-    except TrajectoryError:
-        return None
-
-
-def _height_degrees(camera: Camera) -> float:
-    """Angle between the top and the bottom of the picture, kept where a perspective view makes sense."""
-    middle = (camera.width - 1) / 2
-    top, bottom = camera.directions(np.array([[middle, 0.0], [middle, camera.height - 1.0]]))
-    angle = np.degrees(np.arccos(np.clip(top @ bottom, -1, 1)))
-    return float(np.clip(np.nan_to_num(angle, nan=100.0), 40.0, 100.0))
+    if poses is None:
+        poses = path_or_flight(twin)
+    return poses[len(poses) // 3] if len(poses) else None
 
 
 def _frustum(camera: Camera, pose: np.ndarray, depth_mm: float) -> pv.PolyData:
     """The pyramid that a perspective camera of the same height sees, as lines, ``depth_mm`` long."""
-    half = np.tan(np.radians(_height_degrees(camera)) / 2)
+    half = np.tan(np.radians(height_degrees(camera)) / 2)
     wide = half * camera.width / camera.height
     corners = np.array([[-wide, -half, 1], [wide, -half, 1], [wide, half, 1], [-wide, half, 1]]) * depth_mm
     points = np.vstack([np.zeros(3), corners]) @ pose[:3, :3].T + pose[:3, 3]

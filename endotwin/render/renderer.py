@@ -76,6 +76,11 @@ class View:
         """Float32 [H, W, 3], unit normals in the camera frame; 0 where no surface is seen."""
         return self.image(self._normals)
 
+    @cached_property
+    def albedo(self) -> np.ndarray:
+        """Float32 [H, W, 3], base colour, linear RGB; 0 where no surface is seen."""
+        return self.image(self.attribute(self._renderer.twin.materials.base_color))
+
     def attribute(self, per_vertex: np.ndarray) -> np.ndarray:
         """A vertex attribute [V, ...] interpolated at the hits, [N, ...]."""
         return self.hits.interpolate(self._renderer.twin.surface, per_vertex)
@@ -123,6 +128,16 @@ class Renderer:
         if twin.materials is not self.twin.materials:
             other._normal_and_material = _normal_and_material(twin)
         vars(other).pop("_transmission", None)
+        return other
+
+    def through(self, camera: Camera) -> Renderer:
+        """The renderer of the same twin through another camera."""
+        if camera is self.camera:
+            return self
+        other = copy(self)
+        other.camera = camera
+        for name in ("_transmission", "_sees"):
+            vars(other).pop(name, None)
         return other
 
     def view(self, T_world_camera: np.ndarray, mask: np.ndarray | None = None, exposure: float = 1.0) -> View:

@@ -6,8 +6,10 @@ import hashlib
 import json
 import os
 import re
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field, fields, replace
+from functools import cached_property
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from safetensors import SafetensorError
@@ -23,7 +25,15 @@ from endotwin.run.output import TWIN, write_folder
 from endotwin.sequence import Sequence
 from endotwin.sequence.readers import open_sequence
 from endotwin.surface import Surface
+from endotwin.twin import meshes
 from endotwin.twin.soundness import require_sound
+
+if TYPE_CHECKING:
+    import open3d
+    import pyvista
+    import trimesh
+
+    from endotwin.render import Renderer, View
 
 VERSION = 2
 OWN = re.compile(r"twin\.json|effects\.json|(surface|materials)(-[0-9a-f]{16})?\.safetensors")
@@ -161,17 +171,24 @@ class Twin:
     def __repr__(self) -> str:
         lines = [repr(self.surface), f"camera: {self.camera.model} {self.camera.width}×{self.camera.height}"]
         if self.fitted:
-            lines.append(
-                f"light: L0 {self.light.L0:.4g}, n {self.light.n:.3f}, q {self.light.q:.3f}; "
-                f"γ {self.response.gamma:.4f}, f0 {self.materials.f0:.3f}"
-            )
-            lines.append(f"effects: {', '.join(map(str, self.effects.values())) or 'none'}")
+            light, materials = self.light, self.materials
+            lines += [
+                f"light: L0 {light.L0:.4g}, n {light.n:.3f}, q {light.q:.3f}: L0·cosⁿθ/d^q, d in mm",
+                f"response: γ {self.response.gamma:.4f}",
+                f"materials: {materials.diffuse}, roughness {np.median(materials.roughness):.2f}, "
+                f"f0 {materials.f0:.3f}",
+                f"effects: {', '.join(map(str, self.effects.values())) or 'none'}",
+            ]
         else:
             lines.append("not fitted")
         scores = self.record.get("eval")
         if scores and scores.get("psnr") is not None:
             lines.append(f"held out: {scores['psnr']:.2f} dB, SSIM {scores['ssim']:.4f}")
         return "Twin(\n  " + "\n  ".join(lines) + "\n)"
+
+    def __getstate__(self) -> dict:
+        """What a copy in another process needs: the fields, and not the scene that rays are cast into."""
+        return {each.name: getattr(self, each.name) for each in fields(self)}
 
     def with_record(self, **entries) -> Twin:
         """The same twin with ``entries`` added to its record."""
@@ -192,6 +209,45 @@ class Twin:
                 f"from {sizes[1]}; make it again with 'endotwin fuse'"
             )
         return sequence
+
+    def render(self, T_world_camera: np.ndarray, camera: Camera | None = None) -> View:
+        """The view from a pose: what the photo taken there would look like, with its labels.
+
+        Args:
+            T_world_camera: [4, 4], camera to world, mm, OpenCV axes.
+            camera: to see through; the twin's own unless given.
+
+        Returns:
+            A view with the arrays ``color``, ``radiance``, ``depth_mm``, ``normals``, ``albedo``, ``mask``.
+
+        Raises:
+            TwinError: the twin is not fitted. TrajectoryError: that is no rigid pose.
+        """
+        return self._renderer.through(camera or self.camera).view(T_world_camera)
+
+    @cached_property
+    def _renderer(self) -> Renderer:
+        from endotwin.render import Renderer
+
+        return Renderer(self)
+
+    def to_trimesh(self) -> trimesh.Trimesh:
+        """The mesh in trimesh, with base colour (as displayed), and every map in ``vertex_attributes``."""
+        return meshes.to_trimesh(self)
+
+    def to_open3d(self) -> open3d.t.geometry.TriangleMesh:
+        """The mesh as a tensor mesh of Open3D, every map in ``mesh.vertex``, [V, 1] or [V, 3]."""
+        return meshes.to_open3d(self)
+
+    def to_pyvista(self) -> pyvista.PolyData:
+        """The mesh in pyvista, every map in ``point_data``; ``rgb`` is the base colour as displayed."""
+        return meshes.to_pyvista(self)
+
+    def export(self, path: Path | str, overwrite: bool = False) -> None:
+        """Write the twin for other programs, by the suffix of ``path`` (see ``endotwin.export.FORMATS``)."""
+        from endotwin.export import export
+
+        export(self, path, overwrite)
 
     def show(self, screenshot: Path | None = None) -> None:
         """Open the inspector's window, or write its picture to ``screenshot``."""

@@ -1,0 +1,65 @@
+"""Wavefront OBJ with its material and textures, in the world's mm (OpenCV's axes, as the poses are).
+
+The pictures and the material are named after the mesh, which is written last.
+"""
+
+from __future__ import annotations
+
+import io
+from contextlib import ExitStack
+from pathlib import Path
+
+import numpy as np
+
+from endotwin.export.appearance import Appearance
+from endotwin.export.glb import png, srgb
+from endotwin.export.textured import Textured, textured
+from endotwin.run.output import check_free, whole_file
+from endotwin.twin import Twin
+
+MATERIAL = """# endotwin: light L0 {L0:.6g}, n {n:.6g}, q {q:.6g}; display = x^{gamma:.6g}; f0 {f0:.6g}
+newmtl tissue
+Kd 1 1 1
+Ks {f0:.6g} {f0:.6g} {f0:.6g}
+illum 2
+map_Kd {stem}_base_color.png
+Pr 1
+map_Pr {stem}_roughness.png
+Pm 0
+Pc {coat_f0:.6g}
+Pcr {coat_roughness:.6g}
+norm {stem}_normal.png
+"""
+"""Pr, Pm, Pc, Pcr, map_Pr and norm are the usual extension for physically based materials."""
+
+
+def write_obj(twin: Twin, path: Path, overwrite: bool = False) -> None:
+    """Write ``twin`` as ``path`` and, beside it, its ``.mtl`` and three pictures."""
+    path = Path(path)
+    names = {
+        part: path.with_name(f"{path.stem}_{part}.png") for part in ("base_color", "roughness", "normal")
+    }
+    for each in (path, path.with_suffix(".mtl"), *names.values()):
+        check_free(each, overwrite)
+    mesh, look = textured(twin), Appearance.of(twin)
+    pictures = {
+        "base_color": srgb(mesh.base_color),
+        "roughness": mesh.roughness,
+        "normal": mesh.normal / 2 + 0.5,
+    }
+    contents = {names[part]: png(picture) for part, picture in pictures.items()}
+    contents[path.with_suffix(".mtl")] = MATERIAL.format(stem=path.stem, **look.to_dict()).encode()
+    contents[path] = _mesh(mesh, twin.surface.origin_mm, path.stem)
+    with ExitStack() as opened:  # every file is written before the first one is moved to its place
+        for file, content in reversed(contents.items()):
+            opened.enter_context(whole_file(file, overwrite)).write_bytes(content)
+
+
+def _mesh(mesh: Textured, origin_mm: np.ndarray, stem: str) -> bytes:
+    text = io.StringIO()
+    text.write(f"# endotwin, mm\nmtllib {stem}.mtl\no tissue\nusemtl tissue\n")
+    np.savetxt(text, mesh.vertices_mm + origin_mm, "v %.5f %.5f %.5f")
+    np.savetxt(text, np.c_[mesh.uv[:, 0], 1 - mesh.uv[:, 1]], "vt %.6f %.6f")
+    np.savetxt(text, mesh.normals, "vn %.5f %.5f %.5f")
+    np.savetxt(text, np.repeat(mesh.triangles + 1, 3, axis=1), "f " + " ".join(["%d/%d/%d"] * 3))
+    return text.getvalue().encode()

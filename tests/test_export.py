@@ -1,0 +1,254 @@
+"""Exports are read back by other people's libraries, and show there what the twin shows."""
+
+import json
+import os
+import shutil
+import struct
+import subprocess
+from dataclasses import replace
+from importlib.util import find_spec
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+import tube_twin
+from scipy.spatial.transform import Rotation
+
+from endotwin.cameras import Pinhole
+from endotwin.effects import Effects
+from endotwin.effects.coat import Coat
+from endotwin.effects.interreflection import Interreflection
+from endotwin.effects.offset import Offset
+from endotwin.effects.profile import Profile
+from endotwin.errors import OptionError, OutputError, TwinError
+from endotwin.evaluation.metrics import psnr
+from endotwin.export import FORMATS, export
+from endotwin.export.appearance import diffuse_color
+from endotwin.export.mitsuba import matrix
+from endotwin.light import shading
+
+TURN = np.diag([1.0, -1.0, -1.0])
+GUIDES = ((3.24, 0.55, 0.0), (-2.77, 2.66, 0.0), (-1.27, -3.14, 0.0))
+VALIDATE = """
+require("gltf-validator").validateBytes(new Uint8Array(require("fs").readFileSync(process.argv[1])))
+.then(report => console.log(JSON.stringify(report)))"""
+
+
+@pytest.fixture(scope="module")
+def twin():
+    return tube_twin.fitted(tube_twin.seen(tube_twin.surface(fold_mm=2.0)))
+
+
+@pytest.fixture(scope="module")
+def files(twin, tmp_path_factory) -> Path:
+    """A folder with ``colon`` in every format of one file."""
+    folder = tmp_path_factory.mktemp("exported")
+    for suffix in (".glb", ".ply", ".obj"):
+        export(with_effects(twin, Offset(GUIDES), Coat(0.5, 0.1)), folder / f"colon{suffix}")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def document(files) -> dict:
+    """The JSON of the GLB."""
+    content = (files / "colon.glb").read_bytes()
+    assert struct.unpack_from("<4sII", content) == (b"glTF", 2, len(content))
+    length, kind = struct.unpack_from("<I4s", content, 12)
+    assert kind == b"JSON"
+    return json.loads(content[20 : 20 + length])
+
+
+def with_effects(twin, *effects):
+    return replace(twin, effects=Effects(effects))
+
+
+def test_a_ply_has_every_map_of_every_vertex_by_name(twin, files):
+    mesh = trimesh.load(files / "colon.ply", process=False)
+    np.testing.assert_allclose(mesh.vertices, twin.surface.vertices_mm + twin.surface.origin_mm, atol=1e-4)
+    np.testing.assert_array_equal(mesh.faces, twin.surface.triangles)
+    np.testing.assert_allclose(mesh.vertex_normals, twin.surface.normals, atol=1e-6)
+    rows = mesh.metadata["_ply_raw"]["vertex"]["data"]
+    for index, letter in enumerate("rgb"):
+        np.testing.assert_array_equal(rows[f"base_color_{letter}"], twin.materials.base_color[:, index])
+    np.testing.assert_array_equal(rows["roughness"], twin.materials.roughness)
+    np.testing.assert_array_equal(rows["seen_by"], twin.surface.seen_by)
+    np.testing.assert_array_equal(rows["nearest_mm"], twin.surface.nearest_mm)
+
+
+@pytest.mark.slow
+def test_a_glb_is_the_surface_in_metres_with_y_up(twin, files):
+    scene = trimesh.load(files / "colon.glb")
+    mesh = scene.to_geometry()
+    world = (twin.surface.vertices_mm + twin.surface.origin_mm) @ TURN / 1000
+    np.testing.assert_allclose(mesh.bounds, [world.min(axis=0), world.max(axis=0)], atol=2e-4)
+    from endotwin.fusion._open3d import o3d
+
+    scene = o3d.t.geometry.RaycastingScene()
+    scene.add_triangles(np.float32(mesh.vertices), np.uint32(mesh.faces))
+    distance_m = scene.compute_distance(np.float32(world)).numpy()
+    assert np.quantile(distance_m, 0.99) < 1e-4
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("suffix", [".glb", ".obj"])
+def test_textures_show_the_albedo_that_the_twin_has_there(twin, files, suffix):
+    mesh = trimesh.load(files / f"colon{suffix}", force="mesh")
+    turn, mm = (TURN, 1000) if suffix == ".glb" else (np.eye(3), 1)
+    pose, rays = tube_twin.pose(0.5), twin.camera.pixel_directions[::2, ::2].reshape(-1, 3)
+    origins = np.broadcast_to(pose[:3, 3] @ turn / mm, rays.shape)
+    where, ray, triangle = mesh.ray.intersects_location(
+        origins, rays @ pose[:3, :3].T @ turn, multiple_hits=False
+    )
+    corners = trimesh.triangles.points_to_barycentric(mesh.triangles[triangle], where)
+    uv = np.einsum("nk,nka->na", corners, mesh.visual.uv[mesh.faces[triangle]])
+    material = mesh.visual.material
+    picture = np.asarray(material.baseColorTexture if suffix == ".glb" else material.image)[..., :3] / 255
+    height, width, _ = picture.shape
+    column = np.clip((uv[:, 0] * width).astype(int), 0, width - 1)
+    row = np.clip(((1 - uv[:, 1]) * height).astype(int), 0, height - 1)
+    shown = picture[row, column]
+    linear = np.where(shown <= 0.04045, shown / 12.92, ((shown + 0.055) / 1.055) ** 2.4)
+    view = twin.render(pose)
+    expected = view.image(view.attribute(diffuse_color(twin)))[::2, ::2].reshape(-1, 3)[ray]
+    assert len(ray) > 0.995 * view.mask[::2, ::2].sum()
+    assert psnr(linear, expected, np.ones(len(ray), bool)) > 36
+
+
+@pytest.mark.slow
+def test_the_normal_map_turns_the_light_mesh_into_the_twins_normals(twin):
+    from endotwin.export.textured import textured
+
+    mesh = textured(twin)
+    rows = np.flatnonzero((mesh.uv > 0.01).all(axis=1) & (mesh.uv < 0.99).all(axis=1))
+    height, width, _ = mesh.normal.shape
+    u, v = (mesh.uv[rows] * [width, height]).astype(int).T
+    along, sign = mesh.tangents[rows, :3], mesh.tangents[rows, 3:]
+    np.testing.assert_allclose((along * mesh.normals[rows]).sum(axis=1), 0, atol=1e-5)
+    x, y, z = mesh.normal[v, u].T[..., None]
+    mapped = x * along + y * sign * np.cross(mesh.normals[rows], along) + z * mesh.normals[rows]
+    nearest = trimesh.proximity.ProximityQuery(twin.to_trimesh()).vertex(
+        mesh.vertices_mm[rows] + twin.surface.origin_mm
+    )[1]
+    agreement = (mapped * twin.surface.normals[nearest]).sum(axis=1)
+    assert np.quantile(agreement, 0.05) > 0.98
+
+
+@pytest.mark.slow
+def test_a_glb_carries_the_exact_light_and_its_spots_hang_on_the_camera(twin, document):
+    exact = document["extras"]["endotwin"]
+    assert document["extras"]["mm_per_unit"] == 1000
+    assert [exact[name] for name in ("L0", "n", "q", "gamma", "f0")] == [
+        twin.light.L0, twin.light.n, twin.light.q, twin.response.gamma, twin.materials.f0,
+    ]  # fmt: skip
+    np.testing.assert_allclose(exact["guides_mm"], GUIDES)
+    camera = next(node for node in document["nodes"] if "camera" in node)
+    spots = [document["nodes"][child] for child in camera["children"]]
+    np.testing.assert_allclose([spot["translation"] for spot in spots], GUIDES @ TURN / 1000)
+    (lamp,) = document["extensions"]["KHR_lights_punctual"]["lights"]
+    # q = 2, n = 2: on the axis, 1 m away, a white Lambertian patch of radiance 2·L0·1e-6 a guide
+    np.testing.assert_allclose(3 * lamp["intensity"] / np.pi, 2 * twin.light.L0 * 1e-6)
+    assert lamp["spot"]["innerConeAngle"] == 0
+    np.testing.assert_allclose(lamp["spot"]["outerConeAngle"], np.pi / 2, atol=1e-12)
+    (material,) = document["materials"]
+    coat = material["extensions"]["KHR_materials_clearcoat"]
+    assert coat["clearcoatFactor"] * 0.04 == pytest.approx(0.5 * shading.F0_WATER)
+    specular = material["extensions"]["KHR_materials_specular"]
+    assert specular["specularColorFactor"][0] * 0.04 == pytest.approx(twin.materials.f0)
+
+
+@pytest.mark.slow
+def test_the_camera_of_a_glb_stands_where_the_path_begins_and_looks_along_it(twin, document):
+    from endotwin.synth.trajectories.recorded import path_or_flight
+
+    pose = path_or_flight(twin)[0]
+    camera = next(node for node in document["nodes"] if "camera" in node)
+    turned = Rotation.from_quat(camera["rotation"]).as_matrix()
+    np.testing.assert_allclose(camera["translation"], TURN @ pose[:3, 3] / 1000, atol=1e-7)
+    np.testing.assert_allclose(turned @ [0, 0, -1], TURN @ pose[:3, 2], atol=1e-6)
+    np.testing.assert_allclose(turned @ [0, 1, 0], TURN @ -pose[:3, 1], atol=1e-6)
+    (lens,) = document["cameras"]
+    half = np.arctan(tube_twin.CAMERA.height / 2 / tube_twin.CAMERA.fy)
+    assert lens["perspective"]["yfov"] == pytest.approx(2 * half, rel=0.02)
+
+
+@pytest.mark.slow
+def test_khronos_validator_finds_nothing_wrong_with_a_glb(files):
+    node = shutil.which("node")
+    if not node or subprocess.run([node, "-e", "require('gltf-validator')"], capture_output=True).returncode:
+        pytest.skip("node finds no gltf-validator (npm install gltf-validator, NODE_PATH)")
+    done = subprocess.run([node, "-e", VALIDATE, files / "colon.glb"], capture_output=True, check=True)
+    issues = json.loads(done.stdout)["issues"]
+    assert (issues["numErrors"], issues["numWarnings"]) == (0, 0), issues["messages"]
+
+
+@pytest.mark.slow
+@pytest.mark.skipif("ENDOTWIN_BPY" not in os.environ, reason="ENDOTWIN_BPY names no Python that has bpy")
+def test_blender_opens_a_glb_with_its_textures_lights_and_camera(files):
+    script = """
+import bpy, json, sys
+bpy.ops.wm.read_factory_settings(use_empty=True)
+bpy.ops.import_scene.gltf(filepath=sys.argv[1])
+trees = [material.node_tree for material in bpy.data.materials]
+images = [node.image for tree in trees for node in tree.nodes if node.type == "TEX_IMAGE"]
+lamps = [each for each in bpy.data.objects if each.type == "LIGHT"]
+found = {"images": sorted(image.name for image in images if min(image.size) > 16),
+         "parents": [lamp.parent.type for lamp in lamps]}
+print("FOUND", json.dumps(found))"""
+    done = subprocess.run(
+        [os.environ["ENDOTWIN_BPY"], "-c", script, files / "colon.glb"],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    found = json.loads(next(line for line in done.stdout.splitlines() if line.startswith("FOUND"))[6:])
+    assert found == {"images": ["base colour", "normal", "roughness"], "parents": ["CAMERA"] * 3}
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(find_spec("mitsuba") is None, reason="Mitsuba is not installed (pip install mitsuba)")
+@pytest.mark.parametrize(
+    ("effects", "diffuse"),
+    [
+        ((), "burley"),
+        ((), "lambert"),
+        ((Offset(GUIDES),), "burley"),
+        ((Profile(1.0),), "burley"),
+        ((Coat(2.0, 0.15),), "burley"),
+        ((Coat(2.0, 0.15), Offset(GUIDES)), "lambert"),
+        ((Interreflection(),), "burley"),
+    ],
+    ids=["plain", "lambert", "guides", "profile", "coat", "all", "bounced"],
+)
+def test_mitsuba_renders_what_the_twin_renders(twin, tmp_path, effects, diffuse):
+    import mitsuba
+
+    mitsuba.set_variant("scalar_rgb")
+    twin = replace(with_effects(twin, *effects), materials=replace(twin.materials, diffuse=diffuse))
+    twin = replace(twin, camera=Pinhole(64, 48, 40.0, 40.0, 26.0, 21.5))
+    export(twin, tmp_path / "scene.mitsuba")
+    pose = tube_twin.pose(0.5)
+    scene = mitsuba.load_file(str(tmp_path / "scene.mitsuba" / "scene.xml"), pose=matrix(pose), spp=36)
+    radiance = np.array(mitsuba.render(scene))[..., :3]
+    color = np.clip(radiance, 0, 1) ** twin.response.gamma
+    view = twin.render(pose)
+    bounced = "interreflection" in twin.effects  # endotwin also guesses what tissue beyond the ends adds
+    ratio = np.median(radiance[view.mask] / view.radiance[view.mask])
+    assert ratio == pytest.approx(1, abs=0.07 if bounced else 0.02)
+    assert psnr(color, view.color, view.mask) > (30 if bounced else 35)
+
+
+def test_what_cannot_be_exported_is_refused_in_a_sentence_and_leaves_nothing(twin, tmp_path):
+    with pytest.raises(OptionError, match=", ".join(FORMATS).replace(".", r"\.")):
+        twin.export(tmp_path / "colon.fbx")
+    with pytest.raises(TwinError, match="no materials"):
+        tube_twin.unfitted(twin).export(tmp_path / "colon.ply")
+    (tmp_path / "colon.ply").write_text("precious")
+    with pytest.raises(OutputError, match="overwrite=True"):
+        twin.export(tmp_path / "colon.ply")
+    (tmp_path / "mine.mitsuba").mkdir()
+    (tmp_path / "mine.mitsuba" / "notes.txt").write_text("precious")
+    with pytest.raises(OutputError, match="not endotwin's to replace"):
+        twin.export(tmp_path / "mine.mitsuba", overwrite=True)
+    assert sorted(os.listdir(tmp_path)) == ["colon.ply", "mine.mitsuba"]
+    assert (tmp_path / "colon.ply").read_text() == "precious"
