@@ -65,7 +65,14 @@ def fuse_twin(
     stopwatch = Stopwatch()
     with stopwatch.stage("open"):
         sequence = open_sequence(path, format=format, scale=scale)
-    source = Source(str(Path(path).resolve()), sequence.format, scale, geometry, frames=config.frames)
+    source = Source(
+        str(Path(path).resolve()),
+        sequence.format,
+        scale,
+        geometry,
+        frames=config.frames,
+        split=sequence.split,
+    )
     training = source.training(len(sequence))
     if not training:
         raise SequenceError(f"{path} has no frame to fit: every one is held out; use more frames")
