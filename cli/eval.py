@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from endotwin.cli import console
 
-from endotwin.errors import OutputError
+from endotwin.errors import OptionError, OutputError
 from endotwin.run.output import TWIN, check_free, check_picture
 
 if TYPE_CHECKING:
@@ -71,6 +71,8 @@ def evaluate(
     Example: endotwin eval twin --sheet sheet.png
     Example: endotwin eval --renders theirs --sequence examples/colon_small
     """
+    if twin_folder is None and renders is None:
+        raise OptionError("nothing is named to be scored; give a TWIN, or --renders with their --sequence")
     if sheet is not None:
         check_picture(sheet, overwrite)
     with console.command("eval", profile) as run:

@@ -206,5 +206,5 @@ def test_a_twin_is_scored_on_every_frame_of_another_recording_through_its_own_ca
     assert scores.psnr == pytest.approx(-10 * np.log10((1 / 255) ** 2 / 12), abs=1.0)
     with pytest.raises(OptionError, match="the twin's own sequence"):
         evaluate(twin, sequence=twin.source.path)
-    with pytest.raises(OptionError, match="nothing"):
-        evaluate()
+    with pytest.raises(OptionError, match="no photos to be compared with"):
+        evaluate(renders=tmp_path)

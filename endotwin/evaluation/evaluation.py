@@ -294,10 +294,10 @@ def evaluate(
     Raises:
         TwinError: the twin is not fitted, or no held-out frame has a valid pixel.
         SequenceError: the twin's sequence has moved, or a render is missing or of another size.
-        OptionError: ``sequence`` is the twin's own, or nothing is named to be scored.
+        OptionError: ``sequence`` is the twin's own, or renders have none.
         OutputError: ``sheet`` exists or cannot be written.
     """
-    twin = None if twin is None else as_twin(twin)
+    twin = None if twin is None and renders is not None else as_twin(twin)
     if sheet is not None:
         check_picture(sheet, overwrite)
     sequence, indices = _to_be_scored(twin, sequence, renders)
@@ -333,14 +333,14 @@ def _to_be_scored(
     """The sequence and the indices of its frames that are scored."""
     if sequence is None:
         if twin is None:
-            raise OptionError("nothing is named to be scored; give a twin, or renders with their sequence")
+            raise OptionError(
+                "the renders have no photos to be compared with; give their sequence, or a twin"
+            )
         sequence = twin.sequence()
         return sequence, twin.source.heldout(len(sequence))
     if not isinstance(sequence, Sequence):
         sequence = open_sequence(sequence)
     if twin is None:
-        if renders is None:
-            raise OptionError("a sequence alone has nothing to be scored; give a twin, or renders of it")
         source = Source(str(sequence.path), sequence.format, sequence.scale, split=sequence.split)
         return sequence, source.heldout(len(sequence))
     if sequence.path.resolve() == Path(twin.source.path):
