@@ -107,6 +107,7 @@ def fit_twin(
     effects: Mapping[str, str] | None = None,
     progress: Progress | None = None,
     checkpoint: Path | None = None,
+    device: str = "cpu",
 ) -> Twin:
     """Fit materials, light and response to the training photos.
 
@@ -120,6 +121,7 @@ def fit_twin(
         effects: auto, on or off by name of the effect (see ``endotwin.effects.NAMES``); auto unless named.
         progress: called with (label, done, total).
         checkpoint: file from which a stopped ``endopbr`` goes on; it is removed at the end.
+        device: cpu, cuda, or auto for a GPU where there is one.
 
     Raises:
         OptionError: an option makes no sense. SequenceError: the twin's sequence has moved or cannot be read.
@@ -129,7 +131,7 @@ def fit_twin(
             _check_positive(name, value)
     twin = as_twin(twin)
     config = replace(config, method=method or config.method, budget=budget_s or config.budget)
-    return fit(twin, config, epochs, seed, progress, checkpoint, effects, priced)
+    return fit(twin, config, epochs, seed, progress, checkpoint, effects, priced, device)
 
 
 def synthesize(

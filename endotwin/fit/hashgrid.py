@@ -9,7 +9,7 @@ transpose carries gradients back.
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.sparse
@@ -72,6 +72,28 @@ def corner_slots(points_mm: np.ndarray, cell_mm: float, log2_slots: int) -> tupl
     return mixed.reshape(-1, 8) & ((1 << log2_slots) - 1), weight.reshape(-1, 8)
 
 
+def level_slots(points_mm: Tensor, cells_mm: np.ndarray, log2_slots: int) -> tuple[Tensor, Tensor]:
+    """``corner_slots`` of several levels on the points' device, a table behind the other.
+
+    Args:
+        points_mm: float64 [N, 3].
+
+    Returns:
+        slot int64 [N, L, 8], of level l from l·2**log2_slots on; weight float32 [N, L, 8].
+    """
+    cells = torch.as_tensor(cells_mm, dtype=torch.float64, device=points_mm.device)
+    scaled = points_mm[:, None] / cells[:, None]
+    base = torch.floor(scaled)
+    inside = (scaled - base).float()
+    low = base.long() - HASH_ORIGIN
+    x, y, z = (torch.stack([low[..., k], low[..., k] + 1], dim=2) * prime for k, prime in enumerate(PRIMES))
+    mixed = (x[..., :, None, None] ^ y[..., None, :, None]) ^ z[..., None, None, :]
+    x, y, z = (torch.stack([1 - inside[..., k], inside[..., k]], dim=2) for k in range(3))
+    weight = (x[..., :, None, None] * y[..., None, :, None]) * z[..., None, None, :]
+    first = torch.arange(len(cells), device=points_mm.device)[:, None] << log2_slots
+    return (mixed.flatten(2) & ((1 << log2_slots) - 1)) + first, weight.flatten(2)
+
+
 @dataclass(frozen=True)
 class HashOperator:
     """The sparse operator A of V points and a table of R rows.
@@ -123,6 +145,10 @@ class HashOperator:
         """The identity: each of ``count`` points has a row of its own, as in a cell of edge ``cell_mm``."""
         one = to_torch(scipy.sparse.identity(count, np.float32, "csr"))
         return cls(one, one, np.zeros(count, np.int64), np.arange(count), np.array([cell_mm]), 0)
+
+    def to(self, device: torch.device) -> HashOperator:
+        """The same operator, its matrices on ``device``."""
+        return replace(self, forward_csr=self.forward_csr.to(device), adjoint_csr=self.adjoint_csr.to(device))
 
     def __call__(self, table: Tensor) -> Tensor:
         """Features [V, C] = A·table [R, C], differentiable; the gradient is Aᵀ·g."""
