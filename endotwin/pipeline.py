@@ -86,13 +86,20 @@ def fuse_twin(
 
     with stopwatch.stage("import"):
         from endotwin import fusion
-    surface = fusion.fuse(sequence, frames, training, voxel_mm, config.voxel, report)
+    choice: dict = {}
+    surface = fusion.fuse(sequence, frames, training, voxel_mm, config.voxel, report, choice)
     stopwatch.lap(None)
     if not surface.seen_by.any():
         logger.warning("no training photo of %s shows the mesh: 'endotwin fit' has nothing to fit", path)
     if len(sequence) == 1:
         logger.warning("%s has one frame, which is fitted: none is left to score the twin by", path)
-    made = {"frames": len(frames), "voxel_mm": voxel_mm, "config": asdict(config), **stopwatch.to_dict()}
+    made = {
+        "frames": len(frames),
+        "voxel_mm": voxel_mm,
+        "config": asdict(config),
+        **choice,
+        **stopwatch.to_dict(),
+    }
     return Twin(surface, sequence.camera, source, record={"fuse": made})
 
 

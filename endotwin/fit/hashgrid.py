@@ -82,16 +82,20 @@ def level_slots(points_mm: Tensor, cells_mm: np.ndarray, log2_slots: int) -> tup
         slot int64 [N, L, 8], of level l from l·2**log2_slots on; weight float32 [N, L, 8].
     """
     cells = torch.as_tensor(cells_mm, dtype=torch.float64, device=points_mm.device)
-    scaled = points_mm[:, None] / cells[:, None]
-    base = torch.floor(scaled)
-    inside = (scaled - base).float()
-    low = base.long() - HASH_ORIGIN
-    x, y, z = (torch.stack([low[..., k], low[..., k] + 1], dim=2) * prime for k, prime in enumerate(PRIMES))
-    mixed = (x[..., :, None, None] ^ y[..., None, :, None]) ^ z[..., None, None, :]
-    x, y, z = (torch.stack([1 - inside[..., k], inside[..., k]], dim=2) for k in range(3))
-    weight = (x[..., :, None, None] * y[..., None, :, None]) * z[..., None, None, :]
-    first = torch.arange(len(cells), device=points_mm.device)[:, None] << log2_slots
-    return (mixed.flatten(2) & ((1 << log2_slots) - 1)) + first, weight.flatten(2)
+    mixed, weight = [0] * 8, [1.0] * 8
+    for axis, prime in enumerate(PRIMES):
+        scaled = points_mm[:, axis, None] / cells
+        base = torch.floor(scaled)
+        inside = (scaled - base).float()
+        low = (base.long() - HASH_ORIGIN) * prime
+        hashed, shares = (low, low + prime), (1 - inside, inside)
+        for corner in range(8):
+            side = corner >> (2 - axis) & 1
+            mixed[corner] = mixed[corner] ^ hashed[side]
+            weight[corner] = weight[corner] * shares[side]
+    first = torch.arange(len(cells), device=points_mm.device) << log2_slots
+    slots = [(each & ((1 << log2_slots) - 1)) + first for each in mixed]
+    return torch.stack(slots, dim=2), torch.stack(weight, dim=2)
 
 
 @dataclass(frozen=True)
