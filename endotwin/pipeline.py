@@ -39,6 +39,7 @@ def fuse_twin(
     voxel_mm: float | None = None,
     config: FuseConfig = STANDARD.fuse,
     progress: Progress | None = None,
+    undistort: tuple[int, int] | None = None,
 ) -> Twin:
     """Fuse the depth maps of a sequence into a twin that has a surface and no materials yet.
 
@@ -51,6 +52,7 @@ def fuse_twin(
         voxel_mm: voxel edge; chosen from the depth footprint, times the config's factor, unless given.
         config: how finely to fuse.
         progress: called with (label, done, total).
+        undistort: width and height of a pinhole image to resample to first, as published comparisons do.
 
     Raises:
         SequenceError, CameraError: the sequence cannot be used as it is.

@@ -90,6 +90,7 @@ class Source:
         holdout_every: every n-th frame, from the first, is held out of the fit.
         frames: of more training frames than these, so many are used, evenly spread; None: all.
         split: the frames that the sequence itself says are to be fitted and held out, instead of every n-th.
+        undistort: width and height of the pinhole images that photos were resampled to; None: they were not.
     """
 
     path: str
@@ -99,16 +100,18 @@ class Source:
     holdout_every: int = HOLDOUT_EVERY
     frames: int | None = None
     split: Split | None = None
+    undistort: tuple[int, int] | None = None
 
     @classmethod
     def from_dict(cls, values: dict) -> Source:
         """The source that ``asdict`` made ``values`` of."""
-        split = values.get("split")
-        return cls(**{**values, "split": split and Split(**{k: tuple(v) for k, v in split.items()})})
+        split, undistort = values.get("split"), values.get("undistort")
+        split = split and Split(**{name: tuple(indices) for name, indices in split.items()})
+        return cls(**{**values, "split": split, "undistort": undistort and tuple(undistort)})
 
     def open(self) -> Sequence:
         """The sequence; raises SequenceError if it has moved or changed its shape."""
-        return open_sequence(Path(self.path), format=self.format, scale=self.scale)
+        return open_sequence(Path(self.path), self.format, self.scale, self.undistort)
 
     def heldout(self, count: int) -> list[int]:
         """Indices of the held-out frames among ``count``; none where that would leave nothing to fit."""
