@@ -1,8 +1,8 @@
 """What a sequence of C3VD's size costs: ``python benchmarks/bench_size.py TWIN --frames 300 1000``.
 
 Renders sequences from a fitted twin with ``endotwin synth``, along a path through the poses of its own
-sequence, fuses and fits each, and scores it on its held-out frames. Seconds of cores are printed beside those of
-the wall clock: only where nothing else runs do both tell the same.
+sequence, fuses and fits each, and scores it on its held-out frames. Seconds of cores are printed beside those
+of the wall clock: only where nothing else runs do both tell the same.
 """
 
 from __future__ import annotations
