@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import resource
 import sys
 import time
 from pathlib import Path
@@ -13,6 +12,7 @@ from endotwin.fusion import fuse
 from endotwin.fusion.agreement import Tolerance, agreement
 from endotwin.fusion.tsdf import fuse_tsdf
 from endotwin.fusion.views import read_views
+from endotwin.run.stopwatch import peak_memory_mb
 from endotwin.sequence import Sequence
 from endotwin.sequence.readers import open_sequence
 from endotwin.surface import Surface
@@ -72,7 +72,7 @@ def main(path: Path) -> None:
         f"see through {found.sees_through:.3%}, membrane {found.membrane:.3%})"
     )
     print(f"covered vertices: {np.mean(surface.seen_by > 0):.1%}")
-    print(f"peak memory: {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20:.2f} GiB")
+    print(f"peak memory: {peak_memory_mb() / 1000:.2f} GB")
 
 
 if __name__ == "__main__":

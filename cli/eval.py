@@ -1,4 +1,4 @@
-"""``endotwin eval``: scores on the held-out photos."""
+"""``endotwin eval``: scores on photos that no fit saw."""
 
 from __future__ import annotations
 
@@ -9,11 +9,33 @@ from typing import Annotated
 import typer
 from endotwin.cli import console
 
+from endotwin.errors import OptionError
 from endotwin.run.output import check_picture
 
 
 def evaluate(
-    twin_folder: console.TwinFolder,
+    twin_folder: Annotated[
+        Path | None,
+        typer.Argument(
+            metavar="[TWIN]", show_default=False, help="A fitted twin folder; may be left out with --renders."
+        ),
+    ] = None,
+    sequence: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="OTHER",
+            help="Score TWIN on all frames of this other recording of the same surface, in the same world "
+            "frame; with --renders alone, the sequence that they show.",
+            show_default="the twin's own",
+        ),
+    ] = None,
+    renders: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FOLDER",
+            help="Score another method's pictures of the held-out frames, each named as its photo.",
+        ),
+    ] = None,
     json: Annotated[
         bool, typer.Option("--json", help="Print the scores as JSON instead of a table.")
     ] = False,
@@ -37,24 +59,31 @@ def evaluate(
     """Score a fitted TWIN on the frames held out of the fit: every 8th, from the first.
 
     PSNR, SSIM and, with the extra 'lpips', LPIPS: over the pixels with depth inside the lens circle, and over
-    those whose surface a training photo saw ("covered"). The scores are kept in the twin.
+    those whose surface a training photo saw ("covered"). The scores are kept in the twin, but for those of
+    --sequence and --renders.
 
     Example: endotwin eval twin --sheet sheet.png
+    Example: endotwin eval --renders theirs --sequence examples/colon_small
     """
+    if twin_folder is None and renders is None:
+        raise OptionError("nothing is named to be scored; give a TWIN, or --renders with their --sequence")
     if sheet is not None:
         check_picture(sheet, overwrite)
     with console.command("eval", profile) as run:
         with run.stage("import"):
             from endotwin.evaluation import evaluate, keep_scores
+            from endotwin.sequence.readers import open_sequence
             from endotwin.twin import Twin
         with run.stage("load"):
-            twin = Twin.load(twin_folder)
+            twin = None if twin_folder is None else Twin.load(twin_folder)
+            other = None if sequence is None else open_sequence(sequence, scale=scale or 1.0)
         with run.stage("eval"):
-            scored = twin if scale is None else twin.at_scale(scale)
-            evaluation = evaluate(scored, sheet, run.progress, overwrite)
+            scored = twin if twin is None or scale is None else twin.at_scale(scale)
+            evaluation = evaluate(scored, sheet, run.progress, overwrite, other, renders)
         print(json_format.dumps(evaluation.to_dict()) if json else evaluation)
         with run.stage("write"):
-            kept = keep_scores(evaluation.to_dict(), twin, twin_folder)
+            own = sequence is None and renders is None
+            kept = own and keep_scores(evaluation.to_dict(), twin, twin_folder)
     written = [f"the scores to {twin_folder}"] * kept + [f"the contact sheet to {sheet}"] * bool(sheet)
     if written and not json:
         print("wrote", " and ".join(written))

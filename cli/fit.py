@@ -54,6 +54,10 @@ def fit(
         ),
     ] = "",
     seed: Annotated[int, typer.Option(metavar="N", min=0, help="Seed of all random choices.")] = 0,
+    device: Annotated[
+        str,
+        typer.Option(metavar="cpu|cuda|auto", help="Where to compute; auto: on a GPU if there is one."),
+    ] = "cpu",
     output: Annotated[
         Path | None,
         typer.Option(
@@ -96,6 +100,7 @@ def fit(
                 effects=states,
                 progress=run.progress,
                 checkpoint=target.with_name(f".{target.name}.fit"),
+                device=device,
             )
         run.stopwatch.parts["fit"] = twin.record["fit"]["stages"]
         with run.stage("write"):

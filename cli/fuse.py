@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Annotated
 
@@ -9,6 +10,7 @@ import typer
 from endotwin.cli import console
 
 from endotwin.config import DEFAULT, load_config
+from endotwin.errors import OptionError
 from endotwin.run.output import TWIN, check_free
 
 
@@ -49,6 +51,14 @@ def fuse(
             metavar="MM", help="Voxel edge in millimetres.", show_default="from the depth footprint"
         ),
     ] = None,
+    undistort: Annotated[
+        str | None,
+        typer.Option(
+            metavar="WxH",
+            help="Resample the frames to a pinhole image, such as 640x480, as published comparisons do.",
+            show_default="as photographed",
+        ),
+    ] = None,
     geometry: Annotated[
         str,
         typer.Option(
@@ -65,7 +75,12 @@ def fuse(
     Example: endotwin fuse examples/colon_small -o twin
     """
     check_free(output, overwrite, TWIN)
-    plan = load_config(config).fuse
+    plan, size = load_config(config).fuse, None
+    if undistort is not None:
+        found = re.fullmatch(r"(\d+)[x×](\d+)", undistort)
+        if found is None:
+            raise OptionError(f"the size '{undistort}' is not understood; write it as 640x480")
+        size = int(found[1]), int(found[2])
     with console.command("fuse", profile) as run:
         with run.stage("import"):
             from endotwin.pipeline import fuse_twin
@@ -78,6 +93,7 @@ def fuse(
                 voxel_mm=voxel,
                 config=plan,
                 progress=run.progress,
+                undistort=size,
             )
         run.stopwatch.parts["fuse"] = twin.record["fuse"]["stages"]
         with run.stage("write"):

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import _thread
 import os
 import signal
+import socket
 import sys
 import time
-from threading import Event, Thread
+from threading import Event, Thread, Timer
 from types import FrameType
 
 RETRY_S = 0.05
@@ -40,14 +42,14 @@ def tell(stopped: Stopped) -> int:
 
 def lose_patience() -> None:
     """From now on the process ends soon after SIGINT or SIGTERM, even within a long call of C code."""
-    listening, told = os.pipe()
-    os.set_blocking(told, False)
-    signal.set_wakeup_fd(told, warn_on_full_buffer=False)
+    listening, told = socket.socketpair()  # a pipe would block, on Windows
+    told.setblocking(False)
+    signal.set_wakeup_fd(told.detach(), warn_on_full_buffer=False)
     Thread(target=_end_after, args=(listening,), daemon=True).start()
 
 
-def _end_after(listening: int) -> None:
-    while (number := os.read(listening, 1)[0]) not in SIGNALS:
+def _end_after(listening: socket.socket) -> None:
+    while (number := listening.recv(1)[0]) not in SIGNALS:
         pass
     time.sleep(PATIENCE_S)
     if _heeded.is_set():
@@ -62,8 +64,13 @@ def _stop(number: int, frame: FrameType | None) -> None:
     if not _importing(frame):
         _heeded.set()
         raise Stopped(number)
-    signal.signal(signal.SIGALRM, lambda _, later: _stop(number, later))
-    signal.setitimer(signal.ITIMER_REAL, RETRY_S)
+    if hasattr(signal, "setitimer"):
+        signal.signal(signal.SIGALRM, lambda _, later: _stop(number, later))
+        signal.setitimer(signal.ITIMER_REAL, RETRY_S)
+    else:  # Windows
+        again = Timer(RETRY_S, _thread.interrupt_main, (number,))
+        again.daemon = True
+        again.start()
 
 
 def _importing(frame: FrameType | None) -> bool:

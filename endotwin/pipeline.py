@@ -39,6 +39,7 @@ def fuse_twin(
     voxel_mm: float | None = None,
     config: FuseConfig = STANDARD.fuse,
     progress: Progress | None = None,
+    undistort: tuple[int, int] | None = None,
 ) -> Twin:
     """Fuse the depth maps of a sequence into a twin that has a surface and no materials yet.
 
@@ -51,6 +52,7 @@ def fuse_twin(
         voxel_mm: voxel edge; chosen from the depth footprint, times the config's factor, unless given.
         config: how finely to fuse.
         progress: called with (label, done, total).
+        undistort: width and height of a pinhole image to resample to first, as published comparisons do.
 
     Raises:
         SequenceError, CameraError: the sequence cannot be used as it is.
@@ -65,7 +67,14 @@ def fuse_twin(
     stopwatch = Stopwatch()
     with stopwatch.stage("open"):
         sequence = open_sequence(path, format=format, scale=scale)
-    source = Source(str(Path(path).resolve()), sequence.format, scale, geometry, frames=config.frames)
+    source = Source(
+        str(Path(path).resolve()),
+        sequence.format,
+        scale,
+        geometry,
+        frames=config.frames,
+        split=sequence.split,
+    )
     training = source.training(len(sequence))
     if not training:
         raise SequenceError(f"{path} has no frame to fit: every one is held out; use more frames")
@@ -79,13 +88,20 @@ def fuse_twin(
 
     with stopwatch.stage("import"):
         from endotwin import fusion
-    surface = fusion.fuse(sequence, frames, training, voxel_mm, config.voxel, report)
+    choice: dict = {}
+    surface = fusion.fuse(sequence, frames, training, voxel_mm, config.voxel, report, choice)
     stopwatch.lap(None)
     if not surface.seen_by.any():
         logger.warning("no training photo of %s shows the mesh: 'endotwin fit' has nothing to fit", path)
     if len(sequence) == 1:
         logger.warning("%s has one frame, which is fitted: none is left to score the twin by", path)
-    made = {"frames": len(frames), "voxel_mm": voxel_mm, "config": asdict(config), **stopwatch.to_dict()}
+    made = {
+        "frames": len(frames),
+        "voxel_mm": voxel_mm,
+        "config": asdict(config),
+        **choice,
+        **stopwatch.to_dict(),
+    }
     return Twin(surface, sequence.camera, source, record={"fuse": made})
 
 
@@ -100,6 +116,7 @@ def fit_twin(
     effects: Mapping[str, str] | None = None,
     progress: Progress | None = None,
     checkpoint: Path | None = None,
+    device: str = "cpu",
 ) -> Twin:
     """Fit materials, light and response to the training photos.
 
@@ -113,6 +130,7 @@ def fit_twin(
         effects: auto, on or off by name of the effect (see ``endotwin.effects.NAMES``); auto unless named.
         progress: called with (label, done, total).
         checkpoint: file from which a stopped ``endopbr`` goes on; it is removed at the end.
+        device: cpu, cuda, or auto for a GPU where there is one.
 
     Raises:
         OptionError: an option makes no sense. SequenceError: the twin's sequence has moved or cannot be read.
@@ -122,7 +140,7 @@ def fit_twin(
             _check_positive(name, value)
     twin = as_twin(twin)
     config = replace(config, method=method or config.method, budget=budget_s or config.budget)
-    return fit(twin, config, epochs, seed, progress, checkpoint, effects, priced)
+    return fit(twin, config, epochs, seed, progress, checkpoint, effects, priced, device)
 
 
 def synthesize(

@@ -99,7 +99,7 @@ def test_more_steps_predict_held_out_photos_better_and_bring_the_light_nearer(tu
 def test_the_loss_falls_over_thirty_steps_on_one_set_of_pixels(tube):
     torch.manual_seed(0)
     sequence = tube.source.open()
-    pixels = endopbr.photo_geometry(tube, sequence.frame(1), sequence.lens_mask)
+    pixels = endopbr.Photos(tube, sequence, torch.device("cpu"))[1]
     chosen = np.random.default_rng(0).integers(0, len(pixels["cos"]), PIXELS)
     pixels = {name: value[chosen] for name, value in pixels.items()}
     low, high = tube.surface.vertices_mm.min(axis=0), tube.surface.vertices_mm.max(axis=0)
@@ -112,7 +112,7 @@ def test_the_loss_falls_over_thirty_steps_on_one_set_of_pixels(tube):
     def loss() -> float:
         with torch.no_grad():
             shown = endopbr._predict(pixels, *field(pixels["points_mm"]), shared)
-        return float((shown - torch.from_numpy(pixels["color"]) / 255).abs().mean())
+        return float((shown - pixels["color"] / 255).abs().mean())
 
     losses = [loss()]
     for _ in range(30):
@@ -141,7 +141,7 @@ def test_scaling_albedo_and_light_together_leaves_the_rendering_as_trained(tube)
     field, shared = endopbr.Field(low - 1, high + 1), endopbr.SharedParameters(10.0)
     materials, light = endopbr._baked(field, shared, tube)
     with torch.no_grad():
-        color = field(tube.surface.vertices_mm.astype(np.float64))[0].numpy()
+        color = field(torch.from_numpy(tube.surface.vertices_mm).double())[0].numpy()
     np.testing.assert_allclose(materials.base_color * light.L0, color * shared.light.L0, rtol=1e-4)
     assert materials.f0 * light.L0 == pytest.approx(0.04 * shared.light.L0, rel=1e-5)
     seen = tube.surface.seen_by > 0

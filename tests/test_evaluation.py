@@ -9,10 +9,11 @@ import pytest
 import tube_sequence
 
 from endotwin.effects.gain import Gain
-from endotwin.errors import OutputError, SequenceError, TwinError
+from endotwin.errors import OptionError, OutputError, SequenceError, TwinError
 from endotwin.evaluation import evaluate
 from endotwin.pipeline import fuse_twin
 from endotwin.render import Renderer
+from endotwin.sequence.readers import open_sequence
 from endotwin.twin import Light, Materials, Response, Twin
 
 JSON_KEYS = ["psnr", "ssim", "lpips", "psnr_covered", "covered", "gamma", "light", "frames"]
@@ -150,3 +151,60 @@ def test_a_held_out_frame_without_depth_is_skipped_and_named(twin, tmp_path, cap
 def test_a_twin_without_materials_cannot_be_scored(twin):
     with pytest.raises(TwinError, match="endotwin fit"):
         evaluate(replace(twin, materials=None))
+
+
+def _renders(twin, folder, names) -> None:
+    """The twin's own renderings of its held-out frames in 8 bit, as pictures of another method."""
+    folder.mkdir()
+    renderer, sequence = Renderer(twin), twin.source.open()
+    for index, name in zip(twin.source.heldout(len(sequence)), names, strict=True):
+        view = renderer.view(sequence.T_world_camera[index], sequence.lens_mask)
+        cv2.imwrite(str(folder / name), np.uint8(view.color * 255 + 0.5)[..., ::-1])
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        ("0000_color.png", "0008_color.png"),
+        ("frame_0.png", "frame_8.png"),
+        ("00000.png", "00001.png"),
+    ],
+)
+def test_renders_of_another_method_are_scored_by_the_twins_own_ruler(twin, tmp_path, names, caplog):
+    _renders(twin, tmp_path / "theirs", names)
+    own, theirs = evaluate(twin), evaluate(twin, renders=tmp_path / "theirs")
+    for mine, other in zip(own.frames, theirs.frames, strict=True):
+        assert other.covered == mine.covered
+        # 8 bit: the photos are these very pictures, up to the pixels at which a half is rounded
+        assert other.psnr > mine.psnr and other.psnr_covered > mine.psnr_covered
+    assert ("taken in order" in caplog.text) == (names[1] == "00001.png")
+    alone = evaluate(renders=tmp_path / "theirs", sequence=twin.source.path)
+    assert [frame.psnr for frame in alone.frames] == [frame.psnr for frame in theirs.frames]
+    assert alone.light is None and json.loads(json.dumps(alone.to_dict(), allow_nan=False))["light"] is None
+    assert "γ" not in str(alone) and np.isnan(alone.covered)
+
+
+def test_a_render_that_is_missing_or_of_another_size_is_told(twin, tmp_path):
+    _renders(twin, tmp_path / "theirs", ("0000_color.png", "0008_color.png"))
+    cv2.imwrite(str(tmp_path / "theirs" / "0008_color.png"), np.zeros((5, 7, 3), np.uint8))
+    with pytest.raises(SequenceError, match=r"0008_color\.png is 7×5, but the photos are 96×72"):
+        evaluate(twin, renders=tmp_path / "theirs")
+    (tmp_path / "theirs" / "0008_color.png").unlink()
+    with pytest.raises(SequenceError, match=r"none of held-out frame 0008_color\.png"):
+        evaluate(twin, renders=tmp_path / "theirs")
+
+
+def test_a_twin_is_scored_on_every_frame_of_another_recording_through_its_own_camera(twin, tmp_path):
+    folder = tube_sequence.write(tmp_path / "other", frames=3, width=64, height=48)
+    other = open_sequence(folder)
+    renderer = Renderer(twin, other.camera)
+    for index in range(3):
+        render = renderer.view(other.T_world_camera[index]).color
+        cv2.imwrite(str(other.color_files[index]), np.uint8(render * 255 + 0.5)[..., ::-1])
+    scores = evaluate(twin, sequence=folder)
+    assert [frame.index for frame in scores.frames] == [0, 1, 2]
+    assert scores.psnr == pytest.approx(-10 * np.log10((1 / 255) ** 2 / 12), abs=1.0)
+    with pytest.raises(OptionError, match="the twin's own sequence"):
+        evaluate(twin, sequence=twin.source.path)
+    with pytest.raises(OptionError, match="no photos to be compared with"):
+        evaluate(renders=tmp_path)

@@ -8,9 +8,11 @@ import struct
 import subprocess
 import sys
 import zlib
+from dataclasses import asdict
 
 import cv2
 import numpy as np
+import OpenEXR
 import pytest
 import tifffile
 from c3vd_folder import CAMERA, H, W, photo, truth_poses, write_c3vd
@@ -22,6 +24,8 @@ from endotwin.errors import CameraError, OptionError, SequenceError, TrajectoryE
 from endotwin.sequence.images import PNG_SIGNATURE
 from endotwin.sequence.poses import read_poses, write_c3vd_poses
 from endotwin.sequence.readers import FORMATS, open_sequence
+from endotwin.sequence.sequence import Split
+from endotwin.twin import Source
 
 
 def png(path, array):
@@ -131,6 +135,72 @@ def test_transforms_in_millimetres_scale_positions_and_depth_alike(tmp_path):
     sequence = open_sequence(folder)
     np.testing.assert_allclose(sequence.T_world_camera, poses, atol=1e-9)
     np.testing.assert_allclose(sequence.depth_mm(0), 12.5)
+
+
+@pytest.mark.parametrize(
+    ("lists", "training", "heldout"),
+    [
+        ({"train_filenames": [0, 1, 2], "test_filenames": [4]}, (0, 1, 2), (4,)),
+        ({"train_filenames": [0, 1], "val_filenames": [3], "test_filenames": []}, (0, 1), (3,)),
+        ({"train_filenames": [1, 2]}, (1, 2), (0, 3, 4)),
+        ({"test_filenames": [2], "val_filenames": [0]}, (1, 3, 4), (2,)),
+    ],
+)
+def test_a_split_that_a_transforms_file_lists_is_the_twins(tmp_path, lists, training, heldout):
+    named = {key: [f"./images/frame_{index}.png" for index in found] for key, found in lists.items()}
+    sequence = open_sequence(write_transforms(tmp_path, truth_poses(5), **named))
+    assert sequence.split == Split(training, heldout)
+    source = Source(str(tmp_path), "transforms", split=sequence.split)
+    assert source.training(5) == list(training) and source.heldout(5) == list(heldout)
+    assert Source.from_dict(json.loads(json.dumps(asdict(source)))) == source
+
+
+@pytest.mark.parametrize(
+    ("lists", "told"),
+    [
+        ({"train_filenames": ["images/frame_9.png"]}, "names images/frame_9.png, which is no frame"),
+        ({"train_filenames": "images/frame_0.png"}, "no list of file names"),
+        (
+            {"train_filenames": ["images/frame_0.png"], "test_filenames": ["images/frame_0.png"]},
+            "to be fitted and held out",
+        ),
+    ],
+)
+def test_a_split_that_makes_no_sense_is_refused(tmp_path, lists, told):
+    with pytest.raises(SequenceError, match=told):
+        open_sequence(write_transforms(tmp_path, truth_poses(2), **lists))
+
+
+def test_training_and_test_files_are_one_sequence_with_that_split(tmp_path):
+    poses = truth_poses(12)
+    folder = write_transforms(tmp_path, poses)
+    content = json.loads((folder / "transforms.json").read_text())
+    (folder / "transforms.json").unlink()
+    frames = sorted(content["frames"], key=lambda frame: int(re.sub(r"\D", "", frame["file_path"])))
+    for name, chosen in (("train", [1, 2, 3, 5, 6, 7, 9, 10, 11]), ("test", [0, 4, 8])):
+        part = [{**frames[i], "file_path": frames[i]["file_path"].removesuffix(".png")} for i in chosen]
+        (folder / f"transforms_{name}.json").write_text(json.dumps({**content, "frames": part}))
+    sequence = open_sequence(folder)
+    assert sequence.split == Split((1, 2, 3, 5, 6, 7, 9, 10, 11), (0, 4, 8))
+    np.testing.assert_allclose(sequence.T_world_camera, poses, atol=1e-9)
+    np.testing.assert_allclose(sequence.depth_mm(8), 33, rtol=1e-6)
+    (folder / "transforms_test.json").write_text(json.dumps({**content, "fl_x": 50.0, "frames": frames[:1]}))
+    with pytest.raises(CameraError, match="another camera"):
+        open_sequence(folder)
+    (folder / "transforms_test.json").write_text(json.dumps({**content, "frames": frames[1:2]}))
+    with pytest.raises(SequenceError, match=r"frame_1.png is in transforms_train.json and transforms_test"):
+        open_sequence(folder)
+
+
+def test_openexr_depth_of_a_transforms_file_is_in_its_unit_unless_it_says_a_scale(tmp_path):
+    depth = np.random.default_rng(0).uniform(0.01, 0.08, (H, W)).astype(np.float32)
+    for scale, factor in ((None, 1000.0), (0.5, 500.0)):
+        top = {} if scale is None else {"depth_unit_scale_factor": scale}
+        folder = write_transforms(tmp_path / str(scale), truth_poses(1), **top)
+        header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+        (folder / "depth" / "frame_0.png").unlink()
+        OpenEXR.File(header, {"V": depth}).write(str(folder / "depth" / "frame_0.exr"))
+        np.testing.assert_allclose(open_sequence(folder).depth_mm(0), depth * factor, rtol=1e-6)
 
 
 def test_transforms_of_a_fisheye_and_depth_beside_the_photo(tmp_path):

@@ -1,7 +1,7 @@
-"""How well a twin predicts the photos that its fit never saw.
+"""How well a twin, or another method, predicts the photos that its fit never saw.
 
-The held-out frames are rendered at their own poses and compared with their photos, both display-encoded in
-[0, 1]. Three kinds of pixels:
+The held-out frames, or all of another recording of the same surface, are rendered at their own poses and
+compared with their photos, both display-encoded in [0, 1]. Three kinds of pixels:
 
 - *valid*: inside the lens circle and with a measured depth. Where the twin shows no surface it is black, and
   that counts.
@@ -18,24 +18,26 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 
 import cv2
 import numpy as np
 
-from endotwin.errors import TwinError
+from endotwin.errors import OptionError, TwinError
 from endotwin.evaluation import metrics
 from endotwin.evaluation.kept import keep_scores
+from endotwin.evaluation.renders import read_render, rendered_files
 from endotwin.light import shading
 from endotwin.render import Renderer
 from endotwin.run.output import check_picture
-from endotwin.sequence import Frame
+from endotwin.sequence import Frame, Sequence
 from endotwin.sequence.images import write_png
+from endotwin.sequence.readers import open_sequence
 from endotwin.surface import Surface
-from endotwin.surface.casting import Correspondences
-from endotwin.twin import Light, Twin, as_twin
+from endotwin.surface.casting import Caster, Correspondences
+from endotwin.twin import Light, Source, Twin, as_twin
 
 logger = logging.getLogger("endotwin")
 
@@ -63,7 +65,7 @@ class FrameScore:
         gain: factor on the twin's radiance that its photo shows; 1 where the camera keeps its gain.
         psnr, ssim, lpips: over its valid pixels.
         psnr_covered, ssim_covered, lpips_covered: over its covered pixels.
-        covered: fraction of the valid pixels that are covered.
+        covered: fraction of the valid pixels that are covered; NaN where no twin tells.
     """
 
     index: int
@@ -83,26 +85,26 @@ class Evaluation:
     """Scores of a twin on its held-out frames; a mean score is the mean of the frames' scores.
 
     Attributes:
-        frames: one score a held-out frame. scored: the twin that they are of.
+        frames: one score a held-out frame. scored: the twin that they are of; None: another method's renders.
     """
 
     frames: tuple[FrameScore, ...]
-    scored: Twin
+    scored: Twin | None = None
 
     @property
-    def twin(self) -> Twin:
+    def twin(self) -> Twin | None:
         """The twin with these scores in its record."""
-        return self.scored.with_record(eval=self.to_dict())
+        return self.scored and self.scored.with_record(eval=self.to_dict())
 
     @property
-    def gamma(self) -> float:
+    def gamma(self) -> float | None:
         """What the fit found of the response."""
-        return self.scored.response.gamma
+        return self.scored and self.scored.response.gamma
 
     @property
-    def light(self) -> Light:
+    def light(self) -> Light | None:
         """What the fit found of the light."""
-        return self.scored.light
+        return self.scored and self.scored.light
 
     def mean(self, score: str) -> float:
         """Mean of a score, such as ``psnr_covered``, over the frames that have it; NaN where none has."""
@@ -144,7 +146,7 @@ class Evaluation:
         return {
             **{name: plain(self.mean(name)) for name in means},
             "gamma": self.gamma,
-            "light": asdict(self.light),
+            "light": self.light and asdict(self.light),
             "frames": [
                 {name: plain(value) for name, value in asdict(frame).items()} for frame in self.frames
             ],
@@ -159,6 +161,8 @@ class Evaluation:
         rows.append(["mean", *(_shown(name, self.mean(name)) for name in scores)])
         widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
         lines = ["  ".join(map(str.rjust, row, widths)) for row in rows]
+        if self.light is None:
+            return "\n".join(lines)
         light = f"L0 {self.light.L0:.4g}, n {self.light.n:.3f}, q {self.light.q:.3f}"
         lines.append(f"{light}; γ {self.gamma:.4f}; geometry {self.scored.source.geometry}")
         return "\n".join(lines)
@@ -197,7 +201,7 @@ class _HeldOut:
 
     Attributes:
         photo, render: float32 [H, W, 3], display-encoded, in [0, 1]. gain: factor on the radiance that was
-            rendered. valid, covered: bool [H, W].
+            rendered. valid, covered: bool [H, W]; the latter None where no twin tells.
     """
 
     frame: Frame
@@ -205,14 +209,17 @@ class _HeldOut:
     render: np.ndarray
     gain: float
     valid: np.ndarray
-    covered: np.ndarray
+    covered: np.ndarray | None
 
 
-def _held_out(twin: Twin, progress: Progress | None) -> Iterator[_HeldOut]:
-    """Each held-out frame with a valid pixel, rendered; the others are skipped with a warning."""
-    renderer = Renderer(twin)
-    sequence = twin.sequence()
-    indices = twin.source.heldout(len(sequence))
+Show = Callable[[Frame, np.ndarray, np.ndarray], tuple[np.ndarray, float, np.ndarray | None]]
+"""From a frame, its photo in [0, 1] and its valid pixels: the rendering, its gain, and the covered pixels."""
+
+
+def _compared(
+    sequence: Sequence, indices: list[int], show: Show, progress: Progress | None
+) -> Iterator[_HeldOut]:
+    """Each frame with a valid pixel beside what ``show`` makes of it; others are skipped with a warning."""
     for done, index in enumerate(indices):
         if progress:
             progress("held-out frames", done, len(indices))
@@ -222,18 +229,44 @@ def _held_out(twin: Twin, progress: Progress | None) -> Iterator[_HeldOut]:
             logger.warning("Held-out frame %s has no valid pixel and is not scored.", frame.name)
             continue
         photo = frame.color.astype(np.float32) / 255
-        view, gain = renderer.view(frame.T_world_camera, sequence.lens_mask), 1.0
-        if "gain" in twin.effects:
-            gain = gain_of(photo[valid], view.radiance[valid], twin.response.gamma)
-            view = renderer.view(frame.T_world_camera, sequence.lens_mask, gain)
-        covered = covered_pixels(view.hits, twin.surface, valid.shape)
-        yield _HeldOut(frame, photo, view.color, gain, valid, covered)
+        render, gain, covered = show(frame, photo, valid)
+        yield _HeldOut(frame, photo, render, gain, valid, covered)
     if progress:
         progress("held-out frames", len(indices), len(indices))
 
 
+def _shown_by_twin(twin: Twin, sequence: Sequence) -> Show:
+    renderer = Renderer(twin, sequence.camera)
+
+    def show(frame: Frame, photo: np.ndarray, valid: np.ndarray) -> tuple[np.ndarray, float, np.ndarray]:
+        view, gain = renderer.view(frame.T_world_camera, sequence.lens_mask), 1.0
+        if "gain" in twin.effects:
+            gain = gain_of(photo[valid], view.radiance[valid], twin.response.gamma)
+            view = renderer.view(frame.T_world_camera, sequence.lens_mask, gain)
+        return view.color, gain, valid & covered_pixels(view.hits, twin.surface, valid.shape)
+
+    return show
+
+
+def _shown_by_files(files: Mapping[int, Path], sequence: Sequence, twin: Twin | None) -> Show:
+    """Pictures of another method; what is covered is known where there is a twin."""
+    caster = Caster(twin.surface) if twin else None
+
+    def show(
+        frame: Frame, photo: np.ndarray, valid: np.ndarray
+    ) -> tuple[np.ndarray, float, np.ndarray | None]:
+        render = read_render(files[frame.index], valid.shape)
+        if caster is None:
+            return render, 1.0, None
+        hits = caster.cast(sequence.camera, frame.T_world_camera, valid)
+        return render, 1.0, covered_pixels(hits, caster.surface, valid.shape)
+
+    return show
+
+
 def _score(held_out: _HeldOut) -> FrameScore:
-    photo, render, valid, covered = held_out.photo, held_out.render, held_out.valid, held_out.covered
+    photo, render, valid = held_out.photo, held_out.render, held_out.valid
+    covered = np.zeros_like(valid) if held_out.covered is None else held_out.covered
     similarity = metrics.ssim_map(photo, render, valid)
     distance = np.full(valid.shape, np.nan)
     if metrics.lpips_installed():
@@ -248,49 +281,64 @@ def _score(held_out: _HeldOut) -> FrameScore:
         psnr_covered=metrics.psnr(photo, render, covered),
         ssim_covered=metrics.masked_mean(similarity, covered),
         lpips_covered=metrics.masked_mean(distance, covered),
-        covered=float(covered.sum() / valid.sum()),
+        covered=math.nan if held_out.covered is None else float(covered.sum() / valid.sum()),
     )
 
 
 def evaluate(
-    twin: Twin | Path | str,
+    twin: Twin | Path | str | None = None,
     sheet: Path | None = None,
     progress: Progress | None = None,
     overwrite: bool = False,
+    sequence: Sequence | Path | str | None = None,
+    renders: Path | str | None = None,
 ) -> Evaluation:
-    """Score a fitted twin on the frames that were held out of its fit.
+    """Score a fitted twin, or another method's pictures, on frames that were held out of the fit.
 
     Args:
-        twin: or its folder, in which the scores then are kept.
+        twin: or its folder, in which the scores on its own sequence then are kept. With ``renders`` it may be
+            unfitted, and tells what is covered; or None.
         sheet: PNG file to write a contact sheet to, one row photo | render | error a frame.
         progress: called with (label, done, total).
         overwrite: whether ``sheet`` may exist.
+        sequence: another recording of the twin's surface, in the same world frame, all of which is scored.
+            With ``renders`` alone, the sequence whose held-out frames they show.
+        renders: folder of pictures of the held-out frames, each named as its photo.
 
     Raises:
         TwinError: the twin is not fitted, or no held-out frame has a valid pixel.
-        SequenceError: the twin's sequence has moved.
+        SequenceError: the twin's sequence has moved, or a render is missing or of another size.
+        OptionError: ``sequence`` is the twin's own, or renders have none.
         OutputError: ``sheet`` exists or cannot be written.
     """
-    folder = None if isinstance(twin, Twin) else twin
-    twin = as_twin(twin)
+    kept = sequence is None and renders is None and not isinstance(twin, Twin)
+    folder = twin if kept else None
+    twin = None if twin is None and renders is not None else as_twin(twin)
     if sheet is not None:
         check_picture(sheet, overwrite)
+    sequence, indices = _to_be_scored(twin, sequence, renders)
+    if renders is None:
+        show = _shown_by_twin(twin, sequence)
+    else:
+        show = _shown_by_files(rendered_files(Path(renders), sequence, indices), sequence, twin)
     scores, rows = [], []
-    for held_out in _held_out(twin, progress):
+    for held_out in _compared(sequence, indices, show, progress):
         scores.append(_score(held_out))
         if sheet is not None:
             rows.append(_sheet_row(held_out, scores[-1]))
     if not scores:
         raise TwinError(
-            f"{twin.source.path} has no held-out frame to score; fuse a sequence of two or more frames"
+            f"{sequence.path} has no held-out frame to score; fuse a sequence of two or more frames"
         )
     if sheet is not None:
         write_png(Path(sheet), np.vstack(rows), overwrite)
-    evaluation = Evaluation(tuple(scores), twin)
+    evaluation = Evaluation(tuple(scores), twin if renders is None else None)
+    if renders is not None:
+        return evaluation
     if evaluation.psnr < POOR_DB:
         logger.warning(
             "the twin does not look like its photos (%.1f dB); 'endotwin check %s' looks for the cause",
-            *(evaluation.psnr, twin.source.path),
+            *(evaluation.psnr, sequence.path),
         )
     if folder is not None:
         keep_scores(evaluation.to_dict(), twin, Path(folder))
@@ -302,6 +350,29 @@ def error_heat(photo: np.ndarray, render: np.ndarray, valid: np.ndarray) -> np.n
     [H, W, 3], RGB, black to bright for 0 to ERROR_FULL_SCALE."""
     error = np.abs(photo - render).mean(axis=-1) / ERROR_FULL_SCALE * valid
     return cv2.cvtColor(cv2.applyColorMap(_eight_bit(error), cv2.COLORMAP_INFERNO), cv2.COLOR_BGR2RGB)
+
+
+def _to_be_scored(
+    twin: Twin | None, sequence: Sequence | Path | str | None, renders: Path | str | None
+) -> tuple[Sequence, list[int]]:
+    """The sequence and the indices of its frames that are scored."""
+    if sequence is None:
+        if twin is None:
+            raise OptionError(
+                "the renders have no photos to be compared with; give their sequence, or a twin"
+            )
+        sequence = twin.sequence()
+        return sequence, twin.source.heldout(len(sequence))
+    if not isinstance(sequence, Sequence):
+        sequence = open_sequence(sequence)
+    if twin is None:
+        source = Source(str(sequence.path), sequence.format, sequence.scale, split=sequence.split)
+        return sequence, source.heldout(len(sequence))
+    if sequence.path.resolve() == Path(twin.source.path):
+        raise OptionError(
+            f"{sequence.path} is the twin's own sequence; leave --sequence out, or name another"
+        )
+    return sequence, list(range(len(sequence)))
 
 
 def _sheet_row(held_out: _HeldOut, score: FrameScore) -> np.ndarray:

@@ -10,6 +10,7 @@ from endotwin.effects import RENDERED
 from endotwin.errors import OptionError
 from endotwin.pixels.pace import Pace
 from endotwin.pixels.samples import Views
+from endotwin.run.threads import device_of
 from endotwin.surface.casting import Caster
 from endotwin.twin import Twin
 
@@ -23,6 +24,7 @@ def fit(
     checkpoint: Path | None = None,
     effects: Mapping[str, str] | None = None,
     price: Callable[[Twin, Caster, Views], Twin] = lambda twin, caster, views: twin,
+    device: str = "cpu",
 ) -> Twin:
     """The twin with materials, light and response fitted to its training photos.
 
@@ -35,6 +37,7 @@ def fit(
         effects: auto, on or off by name of the effect, ``twin`` only; auto unless named.
         price: gives the fitted twin's decisions what each effect costs a rendering of the training views,
             ``twin`` only.
+        device: cpu, cuda, or auto for a GPU where there is one.
 
     Raises:
         OptionError: an unknown method, an option that the method does not have, or an effect that is only
@@ -43,6 +46,7 @@ def fit(
     """
     if config.method not in METHODS:
         raise OptionError(f"unknown method '{config.method}'; choose one of: {', '.join(METHODS)}")
+    place = device_of(device)
     rendered = [name for name, state in (effects or {}).items() if name in RENDERED and state == "on"]
     if rendered:
         raise OptionError(
@@ -55,11 +59,11 @@ def fit(
             )
         from endotwin.fit.solve import fit_twin
 
-        return fit_twin(twin, Pace(config, progress), seed, effects or {}, price)
+        return fit_twin(twin, Pace(config, progress), seed, effects or {}, price, place)
     if effects:
         raise OptionError(
             "effects belong to the method twin; endopbr is Han & Wu's model as published, without effects"
         )
     from endotwin.fit.endopbr import fit_endopbr
 
-    return fit_endopbr(twin, config.budget, epochs, seed, progress, checkpoint)
+    return fit_endopbr(twin, config.budget, epochs, seed, progress, checkpoint, place)

@@ -89,6 +89,7 @@ class Checkpoint:
                     kept[f"{number}.{name}"].reshape(shape) for name in ("value", "exp_avg", "exp_avg_sq")
                 )
                 parameter.copy_(value)
+                mean, square = mean.to(parameter.device), square.to(parameter.device)
                 moments = {"step": torch.tensor(float(step)), "exp_avg": mean, "exp_avg_sq": square}
                 self._optimizer.state[parameter] = moments
 

@@ -20,19 +20,23 @@ from torch import Tensor, nn
 
 from endotwin.errors import SequenceError
 from endotwin.fit.checkpoint import Checkpoint, identity
-from endotwin.fit.hashgrid import corner_slots
+from endotwin.fit.hashgrid import level_slots
 from endotwin.light import shading
 from endotwin.light.forward import Lit, Lobes, radiance
 from endotwin.light.incidence import COS_MIN
 from endotwin.pixels.start import ALBEDO_TOP
 from endotwin.run.stopwatch import Stopwatch
-from endotwin.sequence import Frame
+from endotwin.sequence import Frame, Sequence
 from endotwin.surface.vectors import unit
 from endotwin.twin import Light, Materials, Response, Twin
 
 LEVELS, FEATURES, LOG2_SLOTS = 16, 2, 19
 COARSEST_CELLS, FINEST_CELLS = 16, 2048
 """Cells along the scene's longest side at the first and the last level (Müller et al. 2022, table 1)."""
+
+CPU = torch.device("cpu")
+ROOM = 0.5
+"""Share of a GPU's free memory in which photos are kept."""
 
 LOBES = Lobes(shading.F0_DIELECTRIC, burley=False)
 
@@ -58,7 +62,7 @@ class Field(nn.Module):
 
     def __init__(self, low_mm: np.ndarray, high_mm: np.ndarray):
         super().__init__()
-        self.low_mm = low_mm
+        self.register_buffer("low_mm", torch.from_numpy(low_mm))
         longest_mm = float((high_mm - low_mm).max())
         growth = (FINEST_CELLS / COARSEST_CELLS) ** (1 / (LEVELS - 1))
         self.cells_mm = longest_mm / COARSEST_CELLS / growth ** np.arange(LEVELS)
@@ -71,19 +75,11 @@ class Field(nn.Module):
             nn.Linear(HIDDEN, 5),
         )
 
-    def forward(self, points_mm: np.ndarray) -> tuple[Tensor, Tensor, Tensor]:
+    def forward(self, points_mm: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Base colour [N, 3], roughness [N], metallic [N] at points float64 [N, 3], local frame."""
-        slots, weights = [], []
-        for level, cell_mm in enumerate(self.cells_mm):
-            slot, weight = corner_slots(points_mm - self.low_mm, cell_mm, LOG2_SLOTS)
-            slots.append(slot + (level << LOG2_SLOTS))
-            weights.append(weight)
-        slots, weights = (
-            np.stack(slots, 1).reshape(-1, 8),
-            np.stack(weights, 1).reshape(-1, 8).astype(np.float32),
-        )
+        slots, weights = level_slots(points_mm - self.low_mm, self.cells_mm, LOG2_SLOTS)
         features = nn.functional.embedding_bag(
-            torch.from_numpy(slots), self.table, per_sample_weights=torch.from_numpy(weights), mode="sum"
+            slots.reshape(-1, 8), self.table, per_sample_weights=weights.reshape(-1, 8), mode="sum"
         )
         decoded = torch.sigmoid(self.decoder(features.reshape(len(points_mm), -1)))
         return decoded[:, :3], decoded[:, 3], decoded[:, 4]
@@ -136,6 +132,27 @@ def photo_geometry(twin: Twin, frame: Frame, lens_mask: np.ndarray) -> dict[str,
     }
 
 
+class Photos:
+    """The geometry of photos on a device, of which a GPU keeps as many as ROOM of its free memory holds."""
+
+    def __init__(self, twin: Twin, sequence: Sequence, device: torch.device):
+        self._twin, self._sequence, self._device = twin, sequence, device
+        self._kept: dict[int, dict[str, Tensor]] = {}
+        self._left = ROOM * torch.cuda.mem_get_info(device)[0] if device.type == "cuda" else 0
+
+    def __getitem__(self, index: int) -> dict[str, Tensor]:
+        """``photo_geometry`` of frame ``index``."""
+        if index in self._kept:
+            return self._kept[index]
+        frame = self._sequence.frame(index)
+        values = photo_geometry(self._twin, frame, self._sequence.lens_mask)
+        found = {name: torch.from_numpy(value).to(self._device) for name, value in values.items()}
+        self._left -= sum(value.nbytes for value in found.values())
+        if self._left >= 0:
+            self._kept[index] = found
+        return found
+
+
 def fit_endopbr(
     twin: Twin,
     budget_s: float | None,
@@ -143,12 +160,14 @@ def fit_endopbr(
     seed: int,
     progress: Callable[[str, int, int], None] | None = None,
     checkpoint: Path | None = None,
+    device: torch.device = CPU,
 ) -> Twin:
     """Train for ``epochs`` passes over the training images, or until ``budget_s`` seconds are up, whichever
     is first.
 
     A training that was stopped goes on from the file ``checkpoint``, which is removed at the end. The twin is
-    that of a training that was not stopped, bit for bit on one machine.
+    that of a training that was not stopped, bit for bit on one machine without a GPU. All training is done on
+    ``device``; a GPU keeps the photos too, as many as it has memory for.
 
     Raises:
         SequenceError: the training photos show nothing of the surface.
@@ -164,8 +183,8 @@ def fit_endopbr(
     vertices = twin.surface.vertices_mm.astype(np.float64)
     low_mm, high_mm = vertices.min(axis=0), vertices.max(axis=0)
     margin_mm = MARGIN * (high_mm - low_mm).max()
-    field = Field(low_mm - margin_mm, high_mm + margin_mm)
-    shared = SharedParameters(float(np.median(twin.surface.nearest_mm[seen])))
+    field = Field(low_mm - margin_mm, high_mm + margin_mm).to(device)
+    shared = SharedParameters(float(np.median(twin.surface.nearest_mm[seen]))).to(device)
     optimizer = torch.optim.Adam([*field.parameters(), *shared.parameters()], lr=LEARNING_RATE, eps=1e-15)
     sequence = twin.sequence()
     frames = twin.source.training(len(sequence))
@@ -175,16 +194,19 @@ def fit_endopbr(
     first, spent = kept.resume()
     done, started = first, time.perf_counter() - spent
 
-    def batch(step: int) -> dict[str, np.ndarray] | None:
+    photos = Photos(twin, sequence, device)
+
+    def batch(step: int) -> dict[str, Tensor] | None:
         """Pixels of the images that are due; None where those have no depth."""
         epoch, turn = divmod(step, per_epoch)
         order = np.random.default_rng((seed, epoch)).permutation(len(frames))
         chosen = order[turn * IMAGES_A_STEP : (turn + 1) * IMAGES_A_STEP]
-        parts = [photo_geometry(twin, sequence.frame(frames[index]), sequence.lens_mask) for index in chosen]
-        joined = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+        parts = [photos[frames[index]] for index in chosen]
+        joined = {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
         if not len(joined["cos"]):
             return None
         picked = np.random.default_rng((seed, epoch, turn)).integers(0, len(joined["cos"]), PIXELS_A_STEP)
+        picked = torch.from_numpy(picked).to(device)
         return {name: values[picked] for name, values in joined.items()}
 
     with stopwatch.stage("train"), kept.told_when_stopped(), ThreadPoolExecutor(1) as reader:
@@ -210,14 +232,11 @@ def fit_endopbr(
 def _step(field: Field, shared: SharedParameters, optimizer: torch.optim.Optimizer, pixels: dict) -> None:
     optimizer.zero_grad(set_to_none=True)
     base_color, roughness, metallic = field(pixels["points_mm"])
-    error = (
-        _predict(pixels, base_color, roughness, metallic, shared) - torch.from_numpy(pixels["color"]) / 255
-    ).abs()
+    error = (_predict(pixels, base_color, roughness, metallic, shared) - pixels["color"] / 255).abs()
     few = slice(0, PIXELS_A_STEP // 8)
     step_mm = field.cells_mm[-1]
-    beside = pixels["points_mm"][few] + step_mm * unit(
-        np.random.default_rng(0).normal(size=(PIXELS_A_STEP // 8, 3))
-    )
+    aside = torch.from_numpy(unit(np.random.default_rng(0).normal(size=(PIXELS_A_STEP // 8, 3))))
+    beside = pixels["points_mm"][few] + step_mm * aside.to(base_color.device)
     gradient = (field(beside)[0] - base_color[few]).abs().mean() / step_mm
     loss = error.mean() + METALLIC_WEIGHT * metallic.abs().mean() + GRADIENT_WEIGHT * gradient
     loss.backward()
@@ -229,7 +248,7 @@ def _predict(
 ) -> Tensor:
     """C = (f·L·(n·ω)·2π)^γ (Han & Wu 2025), [N, 3]."""
     cos, sin2, log_cos_axis, log_distance = (
-        torch.from_numpy(pixels[name]) for name in ("cos", "sin2", "log_cos_axis", "log_distance")
+        pixels[name] for name in ("cos", "sin2", "log_cos_axis", "log_distance")
     )
     log_L0, log_n, log_q, log_gamma = shared.logs
     lit = Lit.at_lens(cos, sin2, log_cos_axis, log_distance)
@@ -245,11 +264,10 @@ def _baked(field: Field, shared: SharedParameters, twin: Twin) -> tuple[Material
     parts = []
     with torch.no_grad():
         for start in range(0, len(twin.surface.vertices_mm), BAKE_CHUNK):
-            color, roughness, metallic = field(
-                twin.surface.vertices_mm[start : start + BAKE_CHUNK].astype(np.float64)
-            )
+            points_mm = torch.from_numpy(twin.surface.vertices_mm[start : start + BAKE_CHUNK]).double()
+            color, roughness, metallic = field(points_mm.to(shared.logs.device))
             parts.append(torch.cat([color, roughness[:, None], metallic[:, None]], dim=1))
-    values = torch.cat(parts).numpy()
+    values = torch.cat(parts).cpu().numpy()
     seen = twin.surface.seen_by > 0
     scale = float(ALBEDO_TOP / np.percentile(values[seen if seen.any() else slice(None), :3].max(axis=1), 98))
     light = shared.light

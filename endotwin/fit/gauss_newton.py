@@ -25,6 +25,8 @@ from endotwin.light.shading import F0_DIELECTRIC
 from endotwin.pixels.samples import Samples, drawn
 from endotwin.pixels.start import LIGHT_MEAN, LIGHT_SPREAD, PRIOR
 
+CPU = torch.device("cpu")
+
 NOISE_MIN = 1 / 255
 """Least noise assumed, in display values: 8-bit rounding and a step of sensor noise."""
 
@@ -132,7 +134,11 @@ def prior_precision(operator: HashOperator, unit_mm: float) -> Tensor:
 
 
 class GaussNewton:
-    """Steps on one set of samples with one operator."""
+    """Steps on one set of samples with one operator.
+
+    Sums over samples, products and conjugate gradients run on ``device``. What it is given and gives back
+    lies on the CPU.
+    """
 
     def __init__(
         self,
@@ -142,36 +148,54 @@ class GaussNewton:
         unit_mm: float = 1.0,
         seed: int = 0,
         out_of_time: Callable[[], bool] = lambda: False,
+        device: torch.device = CPU,
     ):
+        self._device = device
         vertex_count = operator.forward_csr.shape[0]
         self.triangles = torch.from_numpy(triangles.astype(np.int64))
         self.pattern = MeshPattern(samples, triangles, vertex_count)
-        self.operator = operator
-        self.precision = prior_precision(operator, unit_mm)
+        self._operator = operator.to(device)
+        self._triangles = self.triangles.to(device)
+        self.precision = prior_precision(operator, unit_mm).to(device)
         self._unit_mm = unit_mm
         self.held: tuple[str, ...] = ()
         self.out_of_time = out_of_time
         chosen = drawn(len(samples), SEARCH_SAMPLES, np.random.default_rng(seed))
         self._trial_rows = torch.from_numpy(chosen)
         self.relight(samples)
-        self.squared_adjoint = _squared(operator.adjoint_csr)
+        self.squared_adjoint = _squared(self._operator.adjoint_csr)
 
     def relight(self, samples: Samples) -> None:
         """Go on with the same samples under other light or exposure."""
-        self.samples, self.trial = samples, samples[self._trial_rows]
+        self.samples = samples
+        self._trial, self._placed = samples[self._trial_rows].to(self._device), None
 
     def _global_prior(self, state: State) -> tuple[Tensor, Tensor]:
         return global_prior(self._unit_mm, len(state.shared.vector))
 
+    def _here(self, state: State) -> State:
+        """``state`` on the device, where it is a table of this operator."""
+        if self._device.type == "cpu":
+            return state
+        table = None if state.table is None else state.table.to(self._device)
+        operator = None if state.operator is None else self._operator
+        return replace(state, operator=operator, mean=state.mean.to(self._device), table=table)
+
     def noise(self, state: State) -> float:
         """Robust standard deviation of the residual, in display values."""
-        error = self.trial.color.float() / 255 - self._predict(state)
+        return self._noise(self._here(state))
+
+    def _noise(self, state: State) -> float:
+        error = self._trial.color.float() / 255 - self._predict(state)
         return max(1.4826 * float(error.abs().median()), NOISE_MIN)
 
     def cost(self, state: State, noise: float) -> float:
         """Negative log posterior, on the trial samples scaled up to all of them."""
-        share = len(self.samples) / max(1, len(self.trial))
-        data = robust_cost(self.trial, self._predict(state), HUBER * noise) * share / (noise**2 * TEMPER)
+        return self._cost(self._here(state), noise)
+
+    def _cost(self, state: State, noise: float) -> float:
+        share = len(self.samples) / max(1, len(self._trial))
+        data = robust_cost(self._trial, self._predict(state), HUBER * noise) * share / (noise**2 * TEMPER)
         prior = float((self.precision * state.table**2).double().sum()) / 2
         mean, spread = self._global_prior(state)
         return data + prior + float((((state.shared.vector - mean) / spread) ** 2).sum()) / 2
@@ -183,26 +207,29 @@ class GaussNewton:
         Light, response and f0 move only in a ``joint`` step, which costs six times as much: interreflection
         needs it, whose light depends on the albedo (see ``within`` for the others).
         """
-        noise = self.noise(state)
+        given, state = state, self._here(state)
+        noise = self._noise(state)
         scale = 1 / (noise**2 * TEMPER)
+        if self._placed is None:
+            self._placed = self.samples.to(self._device)
         equations = assemble(
-            self.samples, self.pattern, self.triangles, state.materials, state.shared, HUBER * noise, joint
+            self._placed, self.pattern, self._triangles, state.materials, state.shared, HUBER * noise, joint
         )
         table_step, shared_step = self._solve(state, equations, scale, joint)
-        before = self.cost(state, noise)
+        before = self._cost(state, noise)
         for length in LENGTHS:
             moved = replace(
                 state,
                 table=state.table + length * table_step,
                 shared=bounded(state.shared, state.shared.vector + length * shared_step),
             )
-            after = self.cost(moved, noise)
+            after = self._cost(moved, noise)
             if after < before:
-                return moved, before - after
-        return state, 0.0
+                return replace(given, table=moved.table.cpu(), shared=moved.shared), before - after
+        return given, 0.0
 
     def _predict(self, state: State) -> Tensor:
-        return predict(self.trial, at_pixels(self.trial, self.triangles, state.materials), state.shared)
+        return predict(self._trial, at_pixels(self._trial, self._triangles, state.materials), state.shared)
 
     def _solve(
         self, state: State, equations: NormalEquations, scale: float, joint: bool
@@ -212,17 +239,17 @@ class GaussNewton:
 
         def product(x: Tensor) -> Tensor:
             rows, _, columns = x.shape
-            vertex = (self.operator.forward_csr @ x.reshape(rows, -1)).reshape(-1, CHANNELS, columns)
+            vertex = (self._operator.forward_csr @ x.reshape(rows, -1)).reshape(-1, CHANNELS, columns)
             vertex = link * (equations @ (link * vertex)) * scale
-            back = self.operator.adjoint_csr @ vertex.reshape(len(vertex), -1)
+            back = self._operator.adjoint_csr @ vertex.reshape(len(vertex), -1)
             return back.reshape(rows, CHANNELS, columns) + self.precision[..., None] * x
 
         free = free_directions(state.shared, self.held) if joint else np.zeros((len(spread), 0))
         right = equations.right
         if joint:
-            right = torch.cat([right[..., :1], right[..., 1:] @ torch.from_numpy(free).float()], dim=2)
+            right = torch.cat([right[..., :1], right[..., 1:] @ self._placed_matrix(free)], dim=2)
         right = (right * link * scale).reshape(len(link), -1)
-        right = (self.operator.adjoint_csr @ right).reshape(len(state.table), CHANNELS, -1)
+        right = (self._operator.adjoint_csr @ right).reshape(len(state.table), CHANNELS, -1)
         right[..., 0] -= self.precision * state.table
         block = equations.lumped() * (link * link.transpose(1, 2)) * scale
         block = (self.squared_adjoint @ block.reshape(len(link), -1)).reshape(-1, CHANNELS, CHANNELS)
@@ -237,7 +264,10 @@ class GaussNewton:
         weights, along = _joint_minimum(
             solved, product(solved), right, free.T @ shared_normal @ free, shared_right
         )
-        return solved @ torch.from_numpy(weights).float(), torch.from_numpy(free @ along)
+        return solved @ self._placed_matrix(weights), torch.from_numpy(free @ along)
+
+    def _placed_matrix(self, values: np.ndarray) -> Tensor:
+        return torch.from_numpy(values).float().to(self._device)
 
 
 def free_directions(shared: Globals, held: tuple[str, ...]) -> np.ndarray:
@@ -279,7 +309,7 @@ def _joint_minimum(
         weights of the basis [1 + G]; shared step [G].
     """
     columns = basis.shape[2]
-    flat = [x.reshape(-1, columns).double().numpy() for x in (basis, image, right)]
+    flat = [x.reshape(-1, columns).double().cpu().numpy() for x in (basis, image, right)]
     inner, border = flat[0].T @ flat[1], flat[0].T @ flat[2]
     matrix = np.block([[inner, border[:, 1:]], [border[:, 1:].T, shared_normal]])
     solution = np.linalg.lstsq(matrix, np.r_[border[:, 0], shared_right], rcond=1e-12)[0]

@@ -9,7 +9,7 @@ transpose carries gradients back.
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.sparse
@@ -72,6 +72,32 @@ def corner_slots(points_mm: np.ndarray, cell_mm: float, log2_slots: int) -> tupl
     return mixed.reshape(-1, 8) & ((1 << log2_slots) - 1), weight.reshape(-1, 8)
 
 
+def level_slots(points_mm: Tensor, cells_mm: np.ndarray, log2_slots: int) -> tuple[Tensor, Tensor]:
+    """``corner_slots`` of several levels on the points' device, a table behind the other.
+
+    Args:
+        points_mm: float64 [N, 3].
+
+    Returns:
+        slot int64 [N, L, 8], of level l from l·2**log2_slots on; weight float32 [N, L, 8].
+    """
+    cells = torch.as_tensor(cells_mm, dtype=torch.float64, device=points_mm.device)
+    mixed, weight = [0] * 8, [1.0] * 8
+    for axis, prime in enumerate(PRIMES):
+        scaled = points_mm[:, axis, None] / cells
+        base = torch.floor(scaled)
+        inside = (scaled - base).float()
+        low = (base.long() - HASH_ORIGIN) * prime
+        hashed, shares = (low, low + prime), (1 - inside, inside)
+        for corner in range(8):
+            side = corner >> (2 - axis) & 1
+            mixed[corner] = mixed[corner] ^ hashed[side]
+            weight[corner] = weight[corner] * shares[side]
+    first = torch.arange(len(cells), device=points_mm.device) << log2_slots
+    slots = [(each & ((1 << log2_slots) - 1)) + first for each in mixed]
+    return torch.stack(slots, dim=2), torch.stack(weight, dim=2)
+
+
 @dataclass(frozen=True)
 class HashOperator:
     """The sparse operator A of V points and a table of R rows.
@@ -123,6 +149,10 @@ class HashOperator:
         """The identity: each of ``count`` points has a row of its own, as in a cell of edge ``cell_mm``."""
         one = to_torch(scipy.sparse.identity(count, np.float32, "csr"))
         return cls(one, one, np.zeros(count, np.int64), np.arange(count), np.array([cell_mm]), 0)
+
+    def to(self, device: torch.device) -> HashOperator:
+        """The same operator, its matrices on ``device``."""
+        return replace(self, forward_csr=self.forward_csr.to(device), adjoint_csr=self.adjoint_csr.to(device))
 
     def __call__(self, table: Tensor) -> Tensor:
         """Features [V, C] = A·table [R, C], differentiable; the gradient is Aᵀ·g."""

@@ -113,8 +113,8 @@ class NormalEquations:
 
     def lumped(self) -> Tensor:
         """Row sums as one symmetric 4×4 block a vertex, [V, 4, 4]."""
-        ones = torch.ones(self.right.shape[0], 1)
-        block = torch.zeros(self.right.shape[0], CHANNELS, CHANNELS)
+        ones = torch.ones(self.right.shape[0], 1, device=self.right.device)
+        block = torch.zeros(self.right.shape[0], CHANNELS, CHANNELS, device=self.right.device)
         for c in range(3):
             block[:, c, c] = (self.color[c] @ ones)[:, 0]
             block[:, c, 3] = block[:, 3, c] = (self.mixed[c] @ ones)[:, 0]
@@ -124,7 +124,21 @@ class NormalEquations:
 
 def pairs_of(corner: np.ndarray) -> np.ndarray:
     """Products of barycentrics [N, 3] by CORNER_PAIRS, [N, 6]."""
-    return np.stack([corner[:, i] * corner[:, j] for i, j in CORNER_PAIRS], axis=1)
+    first, second = np.transpose(CORNER_PAIRS)
+    return corner[:, first] * corner[:, second]
+
+
+def sum_products(sums: Tensor, ids: Tensor, left: Tensor, right: Tensor) -> None:
+    """``add_products`` of tensors, which a GPU adds in any order."""
+    sums.index_add_(0, ids, left[:, :, None] * right[:, None])
+
+
+def _add(sums: Tensor, ids: Tensor, left: Tensor, right: Tensor) -> None:
+    """Add products where the tensors lie; on the CPU by a sparse matrix, in a quarter of the time."""
+    if sums.device.type == "cpu":
+        add_products(sums.numpy(), ids.numpy(), left.numpy(), right.numpy())
+    else:
+        sum_products(sums, ids, left, right)
 
 
 def add_products(sums: np.ndarray, ids: np.ndarray, left: np.ndarray, right: np.ndarray) -> None:
@@ -156,14 +170,15 @@ def assemble(
     by more than the little that roughness does to Burley's diffuse lobe.
     """
     count, globals_count = len(pattern.corners), len(shared.vector) if bordered else 0
-    pair_sums = np.zeros((count, len(CORNER_PAIRS), 7), np.float32)
-    corner_sums = np.zeros((count, 3, CHANNELS * (1 + globals_count)), np.float32)
+    device = materials.device
+    pair_sums = torch.zeros(count, len(CORNER_PAIRS), 7, device=device)
+    corner_sums = torch.zeros(count, 3, CHANNELS * (1 + globals_count), device=device)
+    every_id = torch.from_numpy(pattern.compact).to(device)
     normal, right = np.zeros((globals_count,) * 2), np.zeros(globals_count)
     for start, part in zip(range(0, len(samples), CHUNK), samples.chunks(CHUNK), strict=True):
         model = linearise(part, at_pixels(part, triangles, materials), shared)
         residual = Residual.of(part, model.predicted, width)
-        ids = pattern.compact[start : start + len(part)]
-        corner = part.barycentric.numpy()
+        ids, corner = every_id[start : start + len(part)], part.barycentric
         by_roughness = model.by_roughness
         if part.bounce is not None:
             by_roughness = torch.where(part.sin2[:, None] < DIFFUSE_SIN2, by_roughness, 0)
@@ -172,7 +187,7 @@ def assemble(
         products = [weighted_color[:, c] * model.by_color[:, c] for c in range(3)]
         products += [weighted_color[:, c] * by_roughness[:, c] for c in range(3)]
         products.append((weighted_roughness * by_roughness).sum(dim=1))
-        add_products(pair_sums, ids, pairs_of(corner), torch.stack(products, dim=1).numpy())
+        _add(pair_sums, ids, pairs_of(corner), torch.stack(products, dim=1))
         slopes = model.by_globals[..., :globals_count]
         against = torch.cat([residual.error[..., None], slopes], dim=2)
         channels = torch.cat(
@@ -182,18 +197,19 @@ def assemble(
             ],
             dim=1,
         ).flatten(1)
-        add_products(corner_sums, ids, corner, channels.numpy())
+        _add(corner_sums, ids, corner, channels)
         slopes = slopes.flatten(0, 1)
         weighted = (slopes * residual.weight.reshape(-1, 1)).T
-        normal += (weighted @ slopes).double().numpy()
-        right += (weighted @ residual.error.reshape(-1)).double().numpy()
-    vertex = pattern.vector(corner_sums).astype(np.float32)
-    matrices = [pattern.matrix(pair_sums[:, :, k]) for k in range(7)]
+        normal += (weighted @ slopes).double().cpu().numpy()
+        right += (weighted @ residual.error.reshape(-1)).double().cpu().numpy()
+    vertex = pattern.vector(corner_sums.cpu().numpy()).astype(np.float32)
+    pair_sums = pair_sums.cpu().numpy()
+    matrices = [pattern.matrix(pair_sums[:, :, k]).to(device) for k in range(7)]
     return NormalEquations(
         color=matrices[:3],
         mixed=matrices[3:6],
         roughness=matrices[6],
-        right=torch.from_numpy(vertex).reshape(-1, CHANNELS, 1 + globals_count),
+        right=torch.from_numpy(vertex).to(device).reshape(-1, CHANNELS, 1 + globals_count),
         shared=normal,
         shared_right=right,
     )

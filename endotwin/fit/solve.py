@@ -21,6 +21,7 @@ from endotwin.evidence.coat import judged as judged_coat
 from endotwin.evidence.decide import decide
 from endotwin.fit.film import Model
 from endotwin.fit.gauss_newton import (
+    CPU,
     GaussNewton,
     State,
     darkest,
@@ -96,9 +97,16 @@ class _Cost:
     pixels: int
 
 
-def fit_twin(twin: Twin, pace: Pace, seed: int, states: Mapping[str, str], price: Price) -> Twin:
+def fit_twin(
+    twin: Twin,
+    pace: Pace,
+    seed: int,
+    states: Mapping[str, str],
+    price: Price,
+    device: torch.device = CPU,
+) -> Twin:
     """Fit as the module says, in the time that ``pace`` gives, with effects as ``states`` say (auto unless
-    named), whose prices in its decisions are those that ``price`` finds.
+    named), whose prices in its decisions are those that ``price`` finds. Gauss–Newton runs on ``device``.
 
     Raises:
         SequenceError: the training photos show nothing of the surface.
@@ -143,9 +151,9 @@ def fit_twin(twin: Twin, pace: Pace, seed: int, states: Mapping[str, str], price
         wanted = states.get("coat", "auto") if "specular" in decided.effects else "off"
         count = min(LIGHT_PIXELS, int(LIGHT_SHARE * pace.start_pixels))
         rows = telling[torch.from_numpy(drawn(len(telling), count, np.random.default_rng(seed)))]
-        state, cost, coat = _find_light(samples[rows], surface, start, pace, relighting, wanted)
+        state, cost, coat = _find_light(samples[rows], surface, start, pace, relighting, wanted, device)
     with stopwatch.stage("detail"):
-        state, normals, left = _find_detail(samples, twin, state, cost, pace, relighting)
+        state, normals, left = _find_detail(samples, twin, state, cost, pace, relighting, device)
         twin = replace(twin, surface=replace(surface, normals=normals))
     with stopwatch.stage("film"):
         wanted = states.get("film", "auto") if "specular" in decided.effects else "off"
@@ -181,7 +189,13 @@ def _telling(samples: Samples, surface: Surface) -> np.ndarray:
 
 
 def _find_light(
-    samples: Samples, surface: Surface, start: Start, pace: Pace, relighting: Relighting, coat: str
+    samples: Samples,
+    surface: Surface,
+    start: Start,
+    pace: Pace,
+    relighting: Relighting,
+    coat: str,
+    device: torch.device,
 ) -> tuple[State, _Cost, Decision]:
     """Light, response, f0 and coarse materials; what they cost; and whether there is a coat, which is auto,
     on or off."""
@@ -195,6 +209,7 @@ def _find_light(
         operator,
         unit,
         out_of_time=pace.light_is_over,
+        device=device,
     )
     shown = torch.from_numpy(start.base_color) ** start.response.gamma
     mean = torch.cat([shown.median(dim=0).values, torch.tensor([roughness_to_raw(ROUGHNESS_TISSUE)])])
@@ -243,7 +258,13 @@ def _find_light(
 
 
 def _find_detail(
-    samples: Samples, twin: Twin, state: State, cost: _Cost, pace: Pace, relighting: Relighting
+    samples: Samples,
+    twin: Twin,
+    state: State,
+    cost: _Cost,
+    pace: Pace,
+    relighting: Relighting,
+    device: torch.device,
 ) -> tuple[State, np.ndarray, float | None]:
     """The state with finer features on top, normals [V, 3] tilted as the photos show, and what is left of the
     photos (None without time for detail); light, response and the coarse features stay.
@@ -270,7 +291,7 @@ def _find_detail(
     else:
         operator = HashOperator.each(len(surface.vertices_mm), finest_mm)
     state = State(operator, at_vertices, torch.zeros(operator.forward_csr.shape[1], 4), state.shared)
-    solver = GaussNewton(samples, surface.triangles, operator, unit, out_of_time=pace.out_of_time)
+    solver = GaussNewton(samples, surface.triangles, operator, unit, 0, pace.out_of_time, device)
     step_s = 0.0
     for number in range(pace.plan.steps):
         if pace.left(ITERATIONS) <= step_s / 2:

@@ -10,7 +10,8 @@ import numpy as np
 
 from endotwin.errors import OptionError
 from endotwin.fusion.agreement import Tolerance, measured_noise
-from endotwin.fusion.coverage import covered
+from endotwin.fusion.choice import WORTH_PIXELS, chosen, compared, differing, glances
+from endotwin.fusion.coverage import covered, covered_by_glances
 from endotwin.fusion.denoise import denoised, pixel_noise
 from endotwin.fusion.doubts import doubt_frames, doubt_positions, doubt_scatter
 from endotwin.fusion.holes import filled
@@ -22,12 +23,15 @@ from endotwin.fusion.tsdf import footprint_voxel_mm, fuse_tsdf
 from endotwin.fusion.views import Shelf, View, read_views
 from endotwin.sequence import Sequence
 from endotwin.surface import Surface
+from endotwin.surface.casting import Caster
 
 __all__ = ["fuse"]
 
 SAMPLED_FRAMES = 12
 SHORTEST_EDGE_VOXELS = 0.25
 """Marching cubes leaves slivers with edges shorter than this; their ends are made one."""
+NOISY_FOLD = 4
+"""So many frames see each place where depth is noisy, and is averaged over them."""
 COARSE_VOXELS = 2.5
 """The noise is measured about a surface this many times coarser, whose truncation band it rarely leaves."""
 REACH_SIGMAS = 3.0
@@ -44,13 +48,14 @@ def fuse(
     voxel_mm: float | None = None,
     voxel: float = 1.0,
     progress: Progress | None = None,
+    record: dict | None = None,
 ) -> Surface:
     """The surface that agrees with the depth maps of ``frames``; the same input gives the same mesh.
 
     TSDF fusion, vertices refined against the depth maps, two rounds of carve and patch, small holes filled,
     coverage. Noise that differs from pixel to pixel is averaged out first. As many frames are in memory as
     SHELF_BYTES hold, and a few more. A frame without any valid depth is skipped with a warning in the log
-    ``endotwin``.
+    ``endotwin``. Of many pixels, only the frames that see something new are fused (see ``choice``).
 
     Args:
         frames: indices whose depth may be used; all unless given.
@@ -58,6 +63,7 @@ def fuse(
         voxel_mm: voxel edge of the TSDF; chosen from the pixel footprint and the noise unless given.
         voxel: factor on the edge that is chosen.
         progress: called with (stage, done, total) as each frame of a stage begins.
+        record: to which the frames that were fused, and the number of those with nothing new, are added.
 
     Raises:
         SequenceError: no frame has valid depth, or the depth gives no surface.
@@ -74,10 +80,10 @@ def fuse(
 
     reading: dict = {"shelf": Shelf()}
 
-    def views(stage: str, chosen: list[int] = frames, warn: bool = False) -> Iterator[View]:
-        return read_views(sequence, _reported(stage, chosen, progress), warn, **reading)
+    def views(stage: str, of: list[int], warn: bool = False) -> Iterator[View]:
+        return read_views(sequence, _reported(stage, of, progress), warn, **reading)
 
-    finest_mm, median_mm = footprint_voxel_mm(camera, views("voxel size", sample))
+    finest_mm, median_mm, least_mm = footprint_voxel_mm(camera, views("voxel size", sample))
     scatter = pixel_noise(views("pixel noise", sample))
     width_px = WIDTH_PX * scatter * median_mm / finest_mm
     if width_px >= 1:
@@ -87,6 +93,10 @@ def fuse(
         raise OptionError(
             f"A voxel of {voxel_mm:g} mm is larger than the usual depth, {median_mm:.3g} mm; choose less."
         )
+    if voxel_mm is not None and voxel_mm < least_mm:
+        raise OptionError(
+            f"A voxel of {voxel_mm:g} mm needs more than 2 GB of memory; choose {least_mm:.2g} or more."
+        )
     origin_mm = np.median(np.asarray(sequence.T_world_camera, np.float64)[frames, :3, 3], axis=0)
     coarse_mm = COARSE_VOXELS * max(finest_mm, voxel_mm or 0.0)
     coarse = fuse_tsdf(camera, views("noise", sample), origin_mm, coarse_mm, noise_mm=0.0)
@@ -95,18 +105,34 @@ def fuse(
     tolerance = Tolerance.of(voxel_mm, noise)
     doubt_scatter(sequence, max(noise, scatter))
 
+    seen = None
+    if len(frames) * camera.width * camera.height > WORTH_PIXELS:
+        seen = glances(sequence, _reported("choose frames", frames, progress))
+    fused = frames if seen is None else chosen(camera, seen, 1 if width_px < 1 else NOISY_FOLD)
     vertices_mm, triangles = fuse_tsdf(
-        camera, views("TSDF", warn=True), origin_mm, voxel_mm, noise * median_mm
+        camera, views("TSDF", fused, warn=True), origin_mm, voxel_mm, noise * median_mm
     )
     vertices_mm, triangles = without_short_edges(vertices_mm, triangles, SHORTEST_EDGE_VOXELS * voxel_mm)
     surface = surface_of(origin_mm, vertices_mm, triangles)
-    surface = refined(camera, surface, views("refine"), max(voxel_mm, REACH_SIGMAS * noise * median_mm))
-    surface, agreeing = reconciled(camera, surface, views("carve and patch"), tolerance, voxel_mm)
-    doubt_frames(sequence, agreeing)
-    surface, _ = reconciled(camera, surface, views("carve and patch again"), tolerance, voxel_mm)
-    surface = filled(camera, surface, views("fill holes"), tolerance, voxel_mm)
+    surface = refined(
+        camera, surface, views("refine", fused), max(voxel_mm, REACH_SIGMAS * noise * median_mm)
+    )
+    surface, shares = reconciled(camera, surface, views("carve and patch", fused), tolerance, voxel_mm)
+    if seen is not None:
+        shares, places = compared(camera, Caster(surface), seen, tolerance)
+        fused = sorted([*fused, *differing(places, fused)])
+    doubt_frames(sequence, shares)
+    surface, _ = reconciled(camera, surface, views("carve and patch again", fused), tolerance, voxel_mm)
+    surface = filled(camera, surface, views("fill holes", fused), tolerance, voxel_mm)
     surface = smoothed(surface)
-    return covered(camera, surface, views("coverage", photo_frames), sequence.lens_mask, tolerance)
+    photos = [index for index in photo_frames if seen is None or index in set(fused)]
+    surface = covered(camera, surface, views("coverage", photos), sequence.lens_mask, tolerance)
+    if seen is not None:
+        others = [glance for glance in seen if glance.index in set(photo_frames) - set(photos)]
+        surface = covered_by_glances(camera, surface, others, sequence.lens_mask, tolerance)
+    if record is not None:
+        record.update(fused=fused, nothing_new=len(frames) - len(fused))
+    return surface
 
 
 def _reported(stage: str, frames: list[int], progress: Progress | None) -> Iterable[int]:

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import replace
 
 import numpy as np
 
 from endotwin.cameras import Camera
 from endotwin.fusion.agreement import Tolerance
+from endotwin.fusion.choice import STRIDE, Glance
 from endotwin.fusion.refine import Sighting, sighting
 from endotwin.fusion.views import View
 from endotwin.run.ahead import ahead
@@ -46,6 +48,30 @@ def covered(
     for seen in ahead(seen_in, views, threads=THREADS):
         seen_by[seen.vertex] += 1
         nearest_mm[seen.vertex] = np.minimum(nearest_mm[seen.vertex], seen.distance_mm)
+    return surface.with_coverage(seen_by, nearest_mm)
+
+
+def covered_by_glances(
+    camera: Camera, surface: Surface, seen: Iterable[Glance], lens_mask: np.ndarray, tolerance: Tolerance
+) -> Surface:
+    """``surface`` with ``seen_by`` and ``nearest_mm`` of what only those frames saw at which there was just a
+    glance."""
+    caster = Caster(surface)
+    unseen = np.flatnonzero(surface.seen_by == 0)
+    rest = replace(surface, vertices_mm=surface.vertices_mm[unseen], normals=surface.normals[unseen])
+    seen_by, nearest_mm = surface.seen_by.copy(), surface.nearest_mm.copy()
+    for glance in seen:
+        found = sighting(camera, rest, glance.T_world_camera)
+        column, row = np.rint(found.uv).astype(np.int32).T
+        shape = np.array(glance.distance_mm.shape)[:, None] - 1
+        at = np.minimum(np.rint(found.uv.T[::-1] / STRIDE).astype(np.int32), shape)
+        measured_mm = glance.distance_mm[at[0], at[1]]
+        near = found.distance_mm <= measured_mm + tolerance.at(measured_mm)
+        found = found[np.flatnonzero(near & lens_mask[row, column])]
+        found = replace(found, vertex=unseen[found.vertex])
+        found = found[np.flatnonzero(_reached(caster, glance.T_world_camera, found))]
+        seen_by[found.vertex] += 1
+        nearest_mm[found.vertex] = np.minimum(nearest_mm[found.vertex], found.distance_mm)
     return surface.with_coverage(seen_by, nearest_mm)
 
 

@@ -16,6 +16,7 @@ from endotwin.fusion.mesh import boundary_edges, surface_of
 from endotwin.fusion.smooth import neighbour_mean
 from endotwin.fusion.views import View
 from endotwin.run.ahead import ahead
+from endotwin.run.threads import THREADS
 from endotwin.surface import Surface
 
 LONGEST_RIM_VOXELS = 30.0
@@ -182,4 +183,4 @@ def _unpierced(
         at = ~before & (distance_mm <= farthest_mm + tolerance.at(farthest_mm))
         return np.bincount(hole[inside], at.astype(int) - before.astype(int), hole[-1] + 1)
 
-    return sum(ahead(votes, views, threads=2)) >= 0
+    return sum(ahead(votes, views, threads=THREADS)) >= 0

@@ -31,10 +31,10 @@ BLOCKS_PER_CELL = 2.5
 HALF_PIXEL = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
 
 
-def footprint_voxel_mm(camera: Camera, views: Iterable[View]) -> tuple[float, float]:
-    """Voxel edge from the pixel footprint (distance × angle) of a few views, and their median distance.
-
-    The edge grows where the volume that these views measured would need more than ``MAX_BLOCKS`` blocks.
+def footprint_voxel_mm(camera: Camera, views: Iterable[View]) -> tuple[float, float, float]:
+    """Voxel edge from the pixel footprint (distance × angle) of a few views, and their median distance; and
+    the least edge with which what these views measured needs no more than ``MAX_BLOCKS`` blocks, which the
+    first is not below.
     """
     angle = float(np.nanmedian(np.linalg.norm(np.diff(camera.pixel_directions, axis=1), axis=-1)))
     medians_mm, points_mm = [], []
@@ -52,7 +52,8 @@ def footprint_voxel_mm(camera: Camera, views: Iterable[View]) -> tuple[float, fl
         np.floor(np.concatenate(points_mm) / (BLOCK_VOXELS * voxel_mm)).astype(np.int64), axis=0
     )
     # A surface needs blocks in inverse proportion to the square of their size.
-    return voxel_mm * max(1.0, (BLOCKS_PER_CELL * len(cells) / MAX_BLOCKS) ** 0.5), median_mm
+    least_mm = voxel_mm * (BLOCKS_PER_CELL * len(cells) / MAX_BLOCKS) ** 0.5
+    return max(voxel_mm, least_mm), median_mm, least_mm
 
 
 def fuse_tsdf(

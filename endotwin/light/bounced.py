@@ -89,6 +89,10 @@ class Bounce:
     by_scale: Tensor
     gloss: Tensor
 
+    def to(self, device: torch.device) -> Bounce:
+        """The same on ``device``."""
+        return Bounce(**{name: value.to(device) for name, value in vars(self).items()})
+
     def __getitem__(self, index) -> Bounce:
         return Bounce(**{name: value[index] for name, value in vars(self).items()})
 

@@ -45,6 +45,10 @@ class Guided:
     def __len__(self) -> int:
         return len(self.cos_i)
 
+    def to(self, device: torch.device) -> Guided:
+        """The same on ``device``."""
+        return Guided(**{name: value.to(device) for name, value in vars(self).items()})
+
     def __getitem__(self, index) -> Guided:
         return Guided(**{name: value[index] for name, value in vars(self).items()})
 

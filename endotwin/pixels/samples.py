@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -89,8 +89,18 @@ class Samples:
         return len(self.triangle)
 
     def __getitem__(self, index) -> Samples:
+        return self._each(lambda value: value[index])
+
+    def _each(self, change: Callable) -> Samples:
+        """The samples with every column changed."""
         rows = {name: value for name, value in vars(self).items() if value is not None and name != "views"}
-        return replace(self, **{name: value[index] for name, value in rows.items()})
+        return replace(self, **{name: change(value) for name, value in rows.items()})
+
+    def to(self, device: torch.device) -> Samples:
+        """The same samples on ``device``; they themselves where they are there."""
+        if self.triangle.device == device:
+            return self
+        return self._each(lambda value: value.to(device))
 
     @property
     def directions(self) -> np.ndarray:

@@ -17,6 +17,7 @@ from endotwin.errors import OptionError, TwinError
 from endotwin.light import shading
 from endotwin.light.incidence import to_camera
 from endotwin.render.illumination import Illumination, ViewLight
+from endotwin.run.threads import THREADS
 from endotwin.sequence.poses import as_poses
 from endotwin.surface.casting import Caster, Correspondences
 from endotwin.surface.silhouettes import discontinuities
@@ -106,7 +107,7 @@ class Renderer:
         self,
         twin: Twin | Path | str,
         camera: Camera | None = None,
-        threads: int = 2,
+        threads: int = THREADS,
         caster: Caster | None = None,
         exposure: Sequence[float] | float = 1.0,
     ):

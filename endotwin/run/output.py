@@ -8,22 +8,26 @@ it.
 from __future__ import annotations
 
 import errno
-import fcntl
 import filecmp
 import os
 import re
 import shutil
 import tempfile
+import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from endotwin.errors import OutputError
+from endotwin.run import locks
 
 TWIN, DATASET, TRADEOFF = "twin.json", "dataset.json", "ladder.json"
 """Marks of the folders that endotwin writes."""
 
 HIDDEN = ".endotwin-"
+ABANDONED_S = 24 * 3600.0
+"""Where there are no locks, what is older was left by a run that was killed."""
+
 IN_PYTHON = "in Python overwrite=True"
 
 
@@ -188,7 +192,7 @@ def _adopt(old: Path, new: Path, own: Callable[[Path], bool]) -> None:
         target.parent.mkdir(parents=True, exist_ok=True)
         try:
             os.link(file, target, follow_symlinks=False)
-        except OSError:
+        except (OSError, NotImplementedError):
             part = target.with_name(f"{HIDDEN}{target.name}")
             shutil.copy2(file, part, follow_symlinks=False)
             part.replace(target)
@@ -228,7 +232,10 @@ def _write(file: Path, content: bytes) -> None:
 
 def _settle(place: Path) -> None:
     """Wait until what was written to a file, or which names a folder has, is on the disk."""
-    descriptor = os.open(place, os.O_RDONLY)
+    on_windows = os.name == "nt"
+    if on_windows and place.is_dir():
+        return  # which cannot be opened there
+    descriptor = os.open(place, os.O_RDWR if on_windows else os.O_RDONLY)
     try:
         os.fsync(descriptor)
     finally:
@@ -243,39 +250,28 @@ def _workplace(folder: Path) -> Iterator[Path]:
         for left in folder.glob(f"{HIDDEN}*/"):
             _remove_abandoned(left)
         work = Path(tempfile.mkdtemp(prefix=HIDDEN, dir=folder))
-        held = _lock(work, fcntl.LOCK_EX)
+        held = locks.take(work)
     try:
         yield work
     finally:
         shutil.rmtree(work, ignore_errors=True)
-        os.close(held)
+        locks.release(held)
 
 
 def _remove_abandoned(work: Path) -> None:
     """Remove a workplace unless its run is alive, which holds its lock."""
     with suppress(OSError):
-        os.close(_lock(work, fcntl.LOCK_EX | fcntl.LOCK_NB))
+        if not locks.EXIST and time.time() - work.stat().st_mtime < ABANDONED_S:
+            return
+        locks.release(locks.take(work, wait=False))
         shutil.rmtree(work, ignore_errors=True)
 
 
 @contextmanager
 def _locked(folder: Path) -> Iterator[None]:
     """No other run enters such a block of the same folder meanwhile."""
-    descriptor = _lock(folder, fcntl.LOCK_EX)
+    held = locks.take(folder)
     try:
         yield
     finally:
-        os.close(descriptor)
-
-
-def _lock(folder: Path, how: int) -> int:
-    """A descriptor of ``folder`` that holds its lock until it is closed. Raises OSError where it is held and
-    ``how`` says not to wait, or where the file system has no locks and it would not be told."""
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        fcntl.flock(descriptor, how)
-    except OSError:
-        if how & fcntl.LOCK_NB:
-            os.close(descriptor)
-            raise
-    return descriptor
+        locks.release(held)

@@ -13,6 +13,9 @@ from threading import Thread, current_thread, main_thread
 
 from endotwin.errors import OutputError
 
+STOPPING = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGALRM") if hasattr(signal, name))
+"""Signals that end a command: the last is its second try, which Windows does without."""
+
 
 class Pool(ProcessPoolExecutor):
     """So many spawned processes, which Ctrl-C does not reach, each begun by ``begin(*arguments)``.
@@ -28,7 +31,7 @@ class Pool(ProcessPoolExecutor):
         super().__init__(workers, multiprocessing.get_context("spawn"), _enlist, (begin, arguments))
 
     def submit(self, function: Callable, /, *arguments: object) -> Future:
-        with _held_back(signal.SIGINT, signal.SIGTERM, signal.SIGALRM):  # the first call starts the processes
+        with _held_back(*STOPPING):  # the first call starts the processes
             return super().submit(function, *arguments)
 
     def __exit__(self, kind: type | None, error: BaseException | None, trace: object) -> None:
@@ -47,9 +50,10 @@ def _held_back(*numbers: int) -> Iterator[None]:
     """The signals wait until the block has ended; Ctrl-C never reaches a process that is started within.
 
     The mask, which such a process inherits, holds this thread alone: any other takes the signal, and Python
-    then calls its handler in the main thread, in the midst of the block.
+    then calls its handler in the main thread, in the midst of the block. Windows has no mask.
     """
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    masked = hasattr(signal, "pthread_sigmask")
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT}) if masked else None
     came: list[int] = []
     within_main = current_thread() is main_thread()
     handlers = {n: signal.signal(n, lambda number, _: came.append(number)) for n in numbers if within_main}
@@ -58,7 +62,8 @@ def _held_back(*numbers: int) -> Iterator[None]:
     finally:
         for number, handler in handlers.items():
             signal.signal(number, handler)
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        if masked:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
         for number in came[:1]:
             signal.raise_signal(number)
 

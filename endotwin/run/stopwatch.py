@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
-import resource
 import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+
+try:
+    import resource
+except ImportError:  # Windows
+    resource = None
 
 
 def peak_memory_mb() -> float:
@@ -23,6 +27,10 @@ def peak_memory_mb() -> float:
         )
         if line is not None:
             return int(line.split()[1]) * 1024 / 1e6
+    if resource is None:
+        import psutil
+
+        return psutil.Process().memory_info().peak_wset / 1e6
     unit_bytes = 1 if sys.platform == "darwin" else 1024
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit_bytes / 1e6
 

@@ -1,13 +1,44 @@
-"""How many threads work is spread over."""
+"""How many threads work is spread over, and on which device."""
 
 from __future__ import annotations
 
 import os
+from typing import TYPE_CHECKING
 
-THREADS = 2
-"""Of readers and ray casters: more of them wait for each other's memory."""
+from endotwin.errors import OptionError
+
+if TYPE_CHECKING:
+    import torch
+
+DEVICES = ("cpu", "cuda", "auto")
+
+MOST_THREADS = 8
+"""Of readers and ray casters: each holds a frame or two, and more would wait for each other's memory."""
 
 
 def cores() -> int:
     """Cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def _threads() -> int:
+    """As many as there are cores, but no more than OMP_NUM_THREADS, which torch and BLAS heed too."""
+    wanted = os.environ.get("OMP_NUM_THREADS", "").split(",")[0].strip()
+    return max(1, min(cores(), MOST_THREADS, int(wanted) if wanted.isdecimal() else MOST_THREADS))
+
+
+THREADS = _threads()
+"""Of readers and ray casters. No result depends on it: what they make is used in order."""
+
+
+def device_of(name: str) -> torch.device:
+    """The device ``cpu``, ``cuda``, or for ``auto`` a GPU if there is one. Raises OptionError where there is
+    none."""
+    import torch
+
+    if name not in DEVICES:
+        raise OptionError(f"there is no device '{name}'; choose one of: {', '.join(DEVICES)}")
+    there = torch.cuda.is_available()
+    if name == "cuda" and not there:
+        raise OptionError("torch finds no GPU here; install its CUDA build, or choose the device cpu")
+    return torch.device("cuda" if there and name != "cpu" else "cpu")

@@ -46,6 +46,14 @@ class Frame:
     T_world_camera: np.ndarray
 
 
+@dataclass(frozen=True)
+class Split:
+    """The frames of a sequence, by index, that its own files say are to be fitted, and to be scored by."""
+
+    training: tuple[int, ...]
+    heldout: tuple[int, ...]
+
+
 @dataclass(frozen=True, eq=False)
 class Sequence:
     """A posed RGB-D sequence; frames are read when asked for and never kept.
@@ -62,6 +70,7 @@ class Sequence:
         timestamps_s: float64 [N].
         scale: factor on the image size, 1 = native.
         image_size: (width, height) of the files; the camera's own unless given.
+        split: None where the files say nothing of one.
     """
 
     path: Path
@@ -74,6 +83,7 @@ class Sequence:
     timestamps_s: np.ndarray
     scale: float = 1.0
     image_size: tuple[int, int] = (0, 0)
+    split: Split | None = None
 
     def __post_init__(self) -> None:
         if self.image_size == (0, 0):

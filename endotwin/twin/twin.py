@@ -22,7 +22,7 @@ from endotwin.light.film import Film
 from endotwin.light.shading import F0_DIELECTRIC
 from endotwin.run.jsontext import parsed
 from endotwin.run.output import TWIN, write_folder
-from endotwin.sequence import Sequence
+from endotwin.sequence import Sequence, Split
 from endotwin.sequence.readers import open_sequence
 from endotwin.surface import Surface
 from endotwin.twin import meshes
@@ -115,6 +115,8 @@ class Source:
             depth nor photo).
         holdout_every: every n-th frame, from the first, is held out of the fit.
         frames: of more training frames than these, so many are used, evenly spread; None: all.
+        split: the frames that the sequence itself says are to be fitted and held out, instead of every n-th.
+        undistort: width and height of the pinhole images that photos were resampled to; None: they were not.
     """
 
     path: str
@@ -123,19 +125,31 @@ class Source:
     geometry: str = "known"
     holdout_every: int = HOLDOUT_EVERY
     frames: int | None = None
+    split: Split | None = None
+    undistort: tuple[int, int] | None = None
+
+    @classmethod
+    def from_dict(cls, values: dict) -> Source:
+        """The source that ``asdict`` made ``values`` of."""
+        split, undistort = values.get("split"), values.get("undistort")
+        split = split and Split(**{name: tuple(indices) for name, indices in split.items()})
+        return cls(**{**values, "split": split, "undistort": undistort and tuple(undistort)})
 
     def open(self) -> Sequence:
         """The sequence; raises SequenceError if it has moved or changed its shape."""
-        return open_sequence(Path(self.path), format=self.format, scale=self.scale)
+        return open_sequence(Path(self.path), self.format, self.scale, self.undistort)
 
     def heldout(self, count: int) -> list[int]:
         """Indices of the held-out frames among ``count``; none where that would leave nothing to fit."""
+        if self.split is not None:
+            return [index for index in self.split.heldout if index < count]
         return list(range(0, count, self.holdout_every)) if count > 1 else []
 
     def training(self, count: int) -> list[int]:
         """Indices of the frames whose photos may be fitted."""
         heldout = set(self.heldout(count))
-        training = [index for index in range(count) if index not in heldout]
+        every = range(count) if self.split is None else self.split.training
+        training = [index for index in every if index < count and index not in heldout]
         if self.frames is None or len(training) <= self.frames:
             return training
         return [training[i] for i in np.linspace(0, len(training) - 1, self.frames).round().astype(int)]
@@ -309,7 +323,7 @@ class Twin:
             twin = cls(
                 surface=Surface.load(files["surface"]),
                 camera=camera_from_dict(document["camera"], path / TWIN),
-                source=Source(**document["source"]),
+                source=Source.from_dict(document["source"]),
                 materials=Materials.of(load_file(files["materials"]), constants) if constants else None,
                 light=Light(**document["light"]) if document["light"] else None,
                 response=Response(**document["response"]) if document["response"] else None,

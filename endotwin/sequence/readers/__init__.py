@@ -10,6 +10,7 @@ from types import ModuleType
 from endotwin.errors import OptionError, SequenceError
 from endotwin.sequence.readers import c3vd, simcol, transforms, tum
 from endotwin.sequence.sequence import Sequence
+from endotwin.sequence.undistorted import Undistorted
 
 __all__ = ["FORMATS", "open_sequence"]
 
@@ -19,13 +20,19 @@ LEAST_PX = 8
 """Height and width below which an image that was made smaller shows nothing."""
 
 
-def open_sequence(path: Path | str, format: str | None = None, scale: float = 1.0) -> Sequence:
+def open_sequence(
+    path: Path | str,
+    format: str | None = None,
+    scale: float = 1.0,
+    undistort: tuple[int, int] | None = None,
+) -> Sequence:
     """Open a posed RGB-D sequence.
 
     Args:
         path: its folder, or its ``transforms.json``.
         format: one of ``FORMATS``; detected from the content unless given.
         scale: factor on the image size, at most 1; the camera is scaled with it.
+        undistort: width and height of a pinhole image to resample to, as published comparisons do; None: no.
 
     Raises:
         SequenceError: the folder, its files or its poses cannot be used; the message names file and remedy.
@@ -50,6 +57,10 @@ def open_sequence(path: Path | str, format: str | None = None, scale: float = 1.
         )
     sequence = reader.read(path)
     sequence.check()
+    if undistort is not None:
+        if scale != 1:
+            raise OptionError("a size to undistort to is the size of the images; leave the scale out")
+        return Undistorted.of(sequence, *undistort)
     if scale == 1:
         return sequence
     camera = sequence.camera.scaled(scale)

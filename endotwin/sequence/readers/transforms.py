@@ -2,11 +2,15 @@
 
 Unit: positions are metres, as nerfstudio has it, unless the file says ``"unit": "mm"``; depth in that
 unit is the stored value times ``depth_unit_scale_factor`` (0.001 unless given: 16-bit millimetres beside
-positions in metres), or times instant-ngp's ``integer_depth_scale``. Depth is z-depth, 0 for none; PNG,
-TIFF, NPY, NPZ and OpenEXR are read. A frame's depth map is its ``depth_file_path`` (instant-ngp:
-``depth_path``), or else ``depth/NAME.*`` beside the photo's folder, or ``NAME_depth.*`` beside the photo.
-Where a frame's ``mask_path`` is 0, there is no depth. Principal points count from the image's edge, so half
-a pixel is subtracted.
+positions in metres; 1 for OpenEXR, as renderers write it), or times instant-ngp's ``integer_depth_scale``.
+Depth is z-depth, 0 for none; PNG, TIFF, NPY, NPZ and OpenEXR are read. A frame's depth map is its
+``depth_file_path`` (instant-ngp: ``depth_path``), or else ``depth/NAME.*`` beside the photo's folder, or
+``NAME_depth.*`` beside the photo. Where a frame's ``mask_path`` is 0, there is no depth. Principal points
+count from the image's edge, so half a pixel is subtracted.
+
+A split is heeded: ``train_filenames`` and ``test_filenames`` (or else ``val_filenames``) in the file, or
+``transforms_train.json`` and ``transforms_test.json`` (or else ``_val``) in its place. Other frames are
+unused.
 """
 
 from __future__ import annotations
@@ -22,10 +26,17 @@ from endotwin.cameras import Camera, camera_from_dict
 from endotwin.errors import CameraError, SequenceError
 from endotwin.sequence.floatdepth import SUFFIXES, in_mm
 from endotwin.sequence.images import read_color, read_plane
-from endotwin.sequence.poses import frame_times, read_json, read_transforms_poses, transforms_unit_mm
+from endotwin.sequence.poses import (
+    frame_times,
+    read_json,
+    read_transforms_poses,
+    transforms_unit_mm,
+)
+from endotwin.sequence.readers.split import Listing, joined, of_files, of_lists
 from endotwin.sequence.sequence import Sequence
 
 MARK = "transforms.json"
+TRAINING, HELD_OUT = "transforms_train.json", ("transforms_test.json", "transforms_val.json")
 COLOR_SUFFIXES = (".png", ".jpg", ".jpeg", ".tiff", ".tif")
 DEPTH_SUFFIXES = (".png", ".tiff", ".tif", *SUFFIXES)
 PINHOLES = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV")
@@ -47,30 +58,47 @@ DEPTH_SCALE = 0.001
 
 
 def detects(path: Path) -> bool:
-    """Whether ``path`` is a JSON file, or a folder with a ``transforms.json``."""
-    return path.suffix == ".json" if path.is_file() else (path / MARK).is_file()
+    """Whether ``path`` is a JSON file, or a folder with a ``transforms.json`` (or ``_train``)."""
+    if path.is_file():
+        return path.suffix == ".json"
+    return any((path / name).is_file() for name in (MARK, TRAINING))
 
 
 def read(path: Path) -> Sequence:
     """The sequence of a ``transforms.json`` or of the folder that holds it, at its native size."""
-    file = path / MARK if path.is_dir() else path
+    listings = [_listing(file) for file in _files(path)]
+    every = joined(listings)
+    return Sequence(
+        path=path,
+        format="transforms",
+        camera=_common_camera(listings),
+        T_world_camera=every.T_world_camera,
+        color_files=tuple(every.color_files),
+        depth_files=tuple(every.depth_files),
+        read_depth_mm=partial(read_depth_mm, level_mm=every.level_mm, masks=_masks(every)),
+        timestamps_s=frame_times(len(every.frames)),
+        split=of_lists(every) if len(listings) == 1 else of_files(listings, every),
+    )
+
+
+def _files(path: Path) -> list[Path]:
+    """The files that list the frames of ``path``: one, or that to be fitted and that to be scored by."""
+    if path.is_file():
+        return [path]
+    if (path / MARK).is_file():
+        return [path / MARK]
+    return [path / TRAINING, *[path / name for name in HELD_OUT if (path / name).is_file()][:1]]
+
+
+def _listing(file: Path) -> Listing:
     content = read_json(file)
     T_world_camera, frames = read_transforms_poses(file)
     if not frames:
         raise SequenceError(f"{file} has no frames; export the file again")
-    color_files = tuple(_color_file(file, frame) for frame in frames)
-    depth_files = tuple(_depth_file(file, *pair) for pair in zip(frames, color_files, strict=True))
-    level_mm = _depth_scale(file, content) * transforms_unit_mm(content, file)
-    return Sequence(
-        path=path,
-        format="transforms",
-        camera=_camera(file, content, frames, color_files[0]),
-        T_world_camera=T_world_camera,
-        color_files=color_files,
-        depth_files=depth_files,
-        read_depth_mm=partial(read_depth_mm, level_mm=level_mm, masks=_masks(file, frames, depth_files)),
-        timestamps_s=frame_times(len(frames)),
-    )
+    color_files = [_color_file(file, frame) for frame in frames]
+    depth_files = [_depth_file(file, *pair) for pair in zip(frames, color_files, strict=True)]
+    level_mm = _depth_scale(file, content, depth_files[0]) * transforms_unit_mm(content, file)
+    return Listing(file, content, T_world_camera, frames, color_files, depth_files, level_mm)
 
 
 def read_depth_mm(path: Path, level_mm: float, masks: Mapping[Path, Path] | None = None) -> np.ndarray:
@@ -128,10 +156,10 @@ def _depth_file(file: Path, frame: dict, photo: Path) -> Path:
     return found
 
 
-def _masks(file: Path, frames: list[dict], depth_files: tuple[Path, ...]) -> dict[Path, Path]:
+def _masks(listing: Listing) -> dict[Path, Path]:
     """Masks that frames name, by the depth map that each limits; nerfstudio leaves out pixels that are 0."""
-    masks = {}
-    for frame, depth in zip(frames, depth_files, strict=True):
+    file, masks = listing.file, {}
+    for frame, depth in zip(listing.frames, listing.depth_files, strict=True):
         if named := frame.get("mask_path"):
             masks[depth] = file.parent / str(named)
             if not masks[depth].is_file():
@@ -141,11 +169,24 @@ def _masks(file: Path, frames: list[dict], depth_files: tuple[Path, ...]) -> dic
     return masks
 
 
-def _depth_scale(file: Path, content: dict) -> float:
-    scale = content.get("depth_unit_scale_factor", content.get("integer_depth_scale", DEPTH_SCALE))
+def _depth_scale(file: Path, content: dict, depth: Path) -> float:
+    usual = 1.0 if depth.suffix.lower() == ".exr" else DEPTH_SCALE
+    scale = content.get("depth_unit_scale_factor", content.get("integer_depth_scale", usual))
     if isinstance(scale, bool) or not isinstance(scale, int | float) or not 0 < scale < float("inf"):
         raise SequenceError(f"{file}: 'depth_unit_scale_factor' is {scale!r}; set it to a positive number")
     return scale
+
+
+def _common_camera(listings: list[Listing]) -> Camera:
+    """The camera of all files; raises CameraError where they differ in it, or in the scale of their depth."""
+    cameras = [_camera(each.file, each.content, each.frames, each.color_files[0]) for each in listings]
+    for camera, listing in zip(cameras, listings, strict=True):
+        if camera != cameras[0] or listing.level_mm != listings[0].level_mm:
+            raise CameraError(
+                f"{listing.file} has another camera or depth scale than {listings[0].file.name}; give both "
+                "the same"
+            )
+    return cameras[0]
 
 
 def _camera(file: Path, content: dict, frames: list[dict], photo: Path) -> Camera:

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import fcntl
 import json
 import re
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import BinaryIO
 
 from endotwin.errors import OutputError
+from endotwin.run import locks
 from endotwin.run.output import DATASET, IN_PYTHON, check_free, move_folder, unwritable
 from endotwin.synth.run.shard import DATA, DONE
 
@@ -43,11 +42,7 @@ class Partial:
             check_free(self.out, overwrite, DATASET)
         if self.path.exists() and any(self.path.iterdir()) and not (self.path / LOCK).exists():
             raise OutputError(f"{self.path} is no unfinished dataset; move it away, or choose another name")
-        with self._lock() as lock:
-            try:
-                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError as error:
-                raise OutputError(f"{self.path} is at work in another run; wait for it or end it") from error
+        with self._locked():
             finished = self._just_finished(digest)
             if finished:
                 self.remove()
@@ -55,14 +50,22 @@ class Partial:
                 self._begin(digest, overwrite)
             yield finished
 
-    def _lock(self) -> BinaryIO:
-        """The file that a run holds while it is at work here, in the folder, which is made."""
+    @contextmanager
+    def _locked(self) -> Iterator[None]:
+        """Hold the lock of a run that is at work here, in the folder, which is made."""
         try:
             self.path.mkdir(parents=True, exist_ok=True)
-            return (self.path / LOCK).open("wb")
+            (self.path / LOCK).touch()
+            held = locks.take(self.path / LOCK, wait=False)
+        except BlockingIOError as error:
+            raise OutputError(f"{self.path} is at work in another run; wait for it or end it") from error
         except OSError as error:
             self._vanish()
             raise unwritable(self.path, error) from error
+        try:
+            yield
+        finally:
+            locks.release(held)
 
     @property
     def data(self) -> Path:
