@@ -1,5 +1,6 @@
 """Photos aligned to a surface: slopes against finite differences, and what known errors come back as."""
 
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -7,7 +8,6 @@ import numpy as np
 import pytest
 import tube_sequence
 from command_line import invoke
-from scipy.spatial.transform import Rotation
 
 import endotwin
 from endotwin.align.corrections import SHARED, Corrections
@@ -47,7 +47,9 @@ def test_the_adjoint_carries_a_twist_from_one_side_of_a_pose_to_the_other():
 
 def test_slopes_of_corrections_are_those_of_finite_differences():
     start = Corrections.none(tube_sequence.poses(6))
-    start = replace(start, shared=np.r_[some_twists(2, 0.01, 0.01).ravel(), 0.2], own=some_twists(6, 0.01, 0.01, 1))
+    start = replace(
+        start, shared=np.r_[some_twists(2, 0.01, 0.01).ravel(), 0.2], own=some_twists(6, 0.01, 0.01, 1)
+    )
     slopes = start.slopes()
     for k in range(SHARED):
         bent = replace(start, shared=start.shared + 1e-4 * np.eye(SHARED)[k])
@@ -70,7 +72,9 @@ def test_slopes_of_sighted_vertices_are_those_of_finite_differences(tube):
         ends = [sighted(scene, photo, moved(pose, sign * size * np.eye(6)[k]), 2.0) for sign in (-1, 0, 1)]
         common = set.intersection(*(set(end.vertex.tolist()) for end in ends))
         rows = [np.flatnonzero(np.isin(end.vertex, list(common))) for end in ends]
-        low, high = ((end.shown - end.columns @ light)[row] for end, row in zip(ends[::2], rows[::2], strict=True))
+        low, high = (
+            (end.shown - end.columns @ light)[row] for end, row in zip(ends[::2], rows[::2], strict=True)
+        )
         found, told = (high - low) / (2 * size), ends[1].slopes(light)[rows[1], k]
         assert len(common) > 200
         assert np.corrcoef(found, told)[0, 1] > 0.98
@@ -129,7 +133,8 @@ def test_corrected_poses_are_read_back(tube, tmp_path, format):
 
 
 def hand_eye_error(example: Path, folder: Path, twist: np.ndarray) -> np.ndarray:
-    """The example's photos beside depth of its surface at other poses, which a wrong hand-eye matrix gives."""
+    """The example's photos beside depth of its surface at other poses, which a wrong hand-eye matrix
+    gives."""
     import cv2
     import tifffile
 
@@ -160,7 +165,12 @@ def test_a_hand_eye_error_is_found_and_held_out_photos_gain(example, tmp_path, c
     write_c3vd_poses(tmp_path / "true.txt", true)
     assert invoke("fuse", tmp_path / "spoilt", "-o", tmp_path / "twin") == 0
     plain = endotwin.evaluate(endotwin.fit_twin(tmp_path / "twin", align="off"))
-    assert invoke("align", tmp_path / "twin", "--poses", tmp_path / "new.txt", "--against", tmp_path / "true.txt") == 0
+    assert (
+        invoke(
+            "align", tmp_path / "twin", "--poses", tmp_path / "new.txt", "--against", tmp_path / "true.txt"
+        )
+        == 0
+    )
     assert "as aligned: ATE" in capsys.readouterr().out
     found = compare(read_c3vd_poses(tmp_path / "new.txt"), true)
     before = compare(moved(true, -twist), true)
@@ -174,3 +184,17 @@ def test_photos_that_lie_on_the_surface_stay(example):
     aligned = endotwin.align_twin(endotwin.fuse_twin(example))
     assert aligned.registration is None
     assert "lie on the surface" in aligned.record["align"]["reason"]
+
+
+@pytest.mark.slow
+def test_depth_maps_that_moved_with_their_photos_find_back_to_each_other(example, tmp_path):
+    sequence = endotwin.open_sequence(example)
+    true = sequence.T_world_camera
+    wrong = moved(true, some_twists(len(true), 0.07, 0.15))
+    shutil.copytree(example, tmp_path / "spoilt")
+    write_c3vd_poses(tmp_path / "spoilt" / "pose.txt", wrong)
+    aligned = endotwin.align_twin(endotwin.fuse_twin(tmp_path / "spoilt"))
+    assert aligned.registration.with_depth
+    found = compare(aligned.sequence().T_world_camera, true)
+    assert found.rpe_mm < compare(wrong, true).rpe_mm / 3
+    assert found.aligned_mm < compare(wrong, true).aligned_mm / 3

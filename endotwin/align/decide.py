@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from endotwin.align import depths
 from endotwin.align.corrections import Corrections
 from endotwin.align.judge import Errors, Verdict, errors
 from endotwin.align.photos import read_photos
@@ -27,8 +28,8 @@ PHOTOS, VERTICES = 72, 15_000
 
 GLANCE_PHOTOS, GLANCE_VERTICES = 12, 6_000
 
-JUDGES = 4
-"""Every fourth photo judges what the others choose."""
+JUDGES = 3
+"""Every third photo judges what the others choose."""
 
 BLURS = (0.006, 0.003, 0.0015, 0.0015)
 """Widths of the blurs, coarse to fine, of the image's width."""
@@ -37,8 +38,14 @@ OWN_BLURS = (0.0015, 0.0015)
 
 LEAST_BLUR_PX = 0.7
 
-MIN_GAIN_DB, MIN_SIGMAS = 0.2, 3.0
-"""Corrections are kept where they lower other photos' error by so much, and by so many standard errors."""
+MIN_GAIN_DB, MIN_SIGMAS = 0.5, 3.0
+"""Corrections are kept where they lower other photos' error by so much, and by so many sigmas: what the model
+of light lacks is alike in all photos, and to move them all may hide a little of it."""
+
+TOLERATED_SIGMAS = 1.0
+"""Where photos were moved at all, what each has of its own has a tight prior, and stays unless judges lose by
+so
+much: it sharpens what they are compared with, and they themselves get only its drift."""
 
 LEAST_PHOTOS = 8
 """Fewer can neither choose nor judge."""
@@ -83,7 +90,7 @@ class Aligner:
         self.choosers, self.judges = self.frames[~judging], self.frames[judging]
         self.surface, self.camera = twin.surface, self.sequence.camera
         self.photos: dict = {}
-        self._progress = progress or (lambda label, done, total: None)
+        self._progress = progress or _silent
         self._looks, self._expected = 0, len(BLURS) + 2 * len(OWN_BLURS)
 
     def blur_px(self, share: float) -> float:
@@ -115,7 +122,8 @@ class Aligner:
         base = now if levels else was
         own = self._steps(scene, best, self.choosers, OWN_BLURS, own=True)
         more = self._errors(scene, own)
-        if _keeps(more.better_than(base)):
+        further = more.better_than(base)
+        if _keeps(further) or (levels and further.sigmas > -TOLERATED_SIGMAS):
             best, levels, verdict = own, [*levels, "drift"], more.better_than(was)
         if not levels:
             return none, f"what the photos ask for does not help others ({gained})", gained, False
@@ -169,18 +177,28 @@ def align(twin: Twin, state: str = "auto", progress: Progress | None = None) -> 
 
     if state == "off":
         return decided(None, "forced off", None)
+    sequence = twin.source.open()
+    if len(twin.source.training(len(sequence))) < LEAST_PHOTOS:
+        return decided(None, "too few photos to choose and to judge", None)
+    depth_db = depths.gain_db(twin, sequence)
+    if depth_db >= depths.MIN_GAIN_DB:
+        surface, found = depths.registered(twin, sequence, progress or _silent)
+        twin = replace(twin, surface=surface)
+        reason = f"depth maps, which agree better by {depth_db:.1f} dB once each may move with its photo"
+        return decided(_registration(found, with_depth=True), reason, None)
     aligner = Aligner(twin, progress)
-    if len(aligner.frames) < LEAST_PHOTOS:
-        return decided(None, f"{len(aligner.frames)} photos are too few to choose and to judge", None)
     if state == "auto":
         asked_db = aligner.asked_db()
-        if asked_db < MIN_GAIN_DB:
-            return decided(
-                None, f"the photos lie on the surface: no more than {asked_db:+.2f} dB to gain", None
-            )
+        if asked_db < MIN_GAIN_DB / 2:
+            reason = f"the photos lie on the surface: no more than {asked_db:+.2f} dB to gain"
+            return decided(None, reason, None)
     found, reason, verdict, any_ = aligner.run(state == "on")
     registration = _registration(found) if any_ else None
     return decided(registration, reason, None if verdict is None else round(verdict.gain_db, 3))
+
+
+def _silent(label: str, done: int, total: int) -> None:
+    """Nobody watches."""
 
 
 def _keeps(verdict: Verdict) -> bool:
@@ -192,7 +210,7 @@ def _cost_db(before: Looked, after: Looked) -> float:
     return 20 * float(np.log10(before.texture.width / after.texture.width))
 
 
-def _registration(found: Corrections) -> Registration:
+def _registration(found: Corrections, with_depth: bool = False) -> Registration:
     norm, shared = np.linalg.norm, found.shared
     own = np.sqrt((found.own**2).mean(axis=0))
     named = {
@@ -205,4 +223,4 @@ def _registration(found: Corrections) -> Registration:
         "own_deg": np.degrees(norm(own[:3])),
     }
     named = {name: round(float(value), 4) for name, value in named.items()}
-    return Registration(tuple(map(tuple, found.twists.tolist())), named)
+    return Registration(tuple(map(tuple, found.twists.tolist())), named, with_depth)

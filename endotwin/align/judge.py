@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import scipy.special
 
 from endotwin.align.photos import Photo
 from endotwin.align.rims import rim
@@ -19,8 +20,8 @@ LEAST = 100
 
 @dataclass(frozen=True)
 class Verdict:
-    """By how much corrections lower the error of photos that did not choose them: dB, and in standard errors
-    of the mean over ``photos``."""
+    """By how much corrections lower the error of ``photos`` that did not choose them: dB, and in sigmas: the
+    normal deviate that is as rare as Student's t of so few photos."""
 
     gain_db: float
     sigmas: float
@@ -52,9 +53,11 @@ class Errors:
         if len(total) < 2:
             return Verdict(0.0, 0.0, len(total))
         gained = total[:, 0] - total[:, 1]
-        error = max(float(gained.std(ddof=1)) / np.sqrt(len(gained)), 1e-12)
+        t = float(gained.mean()) / max(float(gained.std(ddof=1)) / np.sqrt(len(gained)), 1e-12)
         gain_db = 10 * np.log10(total[:, 0].sum() / max(total[:, 1].sum(), 1e-12))
-        return Verdict(float(gain_db), float(gained.mean()) / error, len(total))
+        rare = scipy.special.stdtr(len(gained) - 1, -abs(t))
+        sigmas = -np.sign(t) * scipy.special.ndtri(max(rare, 1e-300))
+        return Verdict(float(gain_db), float(sigmas), len(total))
 
 
 def errors(

@@ -180,7 +180,7 @@ def _frame_samples(
     generator: np.random.Generator,
 ) -> Samples:
     chosen = lens_mask & np.isfinite(frame.depth_mm)
-    if twin.registration is None:
+    if twin.registration is None or twin.registration.with_depth:
         chosen &= ~discontinuities(frame.depth_mm)
         if share < 1:
             chosen &= generator.random(chosen.shape, np.float32) < share

@@ -13,17 +13,19 @@ from endotwin.sequence import Sequence
 
 @dataclass(frozen=True)
 class Registration:
-    """Corrections of the poses that a sequence was written with; depth maps stay where they are.
+    """Corrections of the poses that a sequence was written with.
 
     Attributes:
         twists: one a frame, T_world_camera = T_written · exp(twist): a rotation vector in radians, then a
             translation in mm, in the camera's frame (SciPy's exponential coordinates).
         found: what they are made of, by name: ``model_mm``, ``model_deg``, ``hand_eye_mm``, ``hand_eye_deg``,
             ``lag_frames``, and ``own_mm``, ``own_deg``: what photos have of their own, root mean square.
+        with_depth: whether depth maps move with their photos, or stay where they are.
     """
 
     twists: tuple[tuple[float, ...], ...]
     found: dict[str, float] = field(default_factory=dict)
+    with_depth: bool = False
 
     def poses(self, T_written: np.ndarray) -> np.ndarray:
         """The corrected poses float64 [N, 4, 4] of written ones."""
@@ -49,4 +51,4 @@ class Registration:
         twists = np.array(values["twists"], np.float64)
         if twists.ndim != 2 or twists.shape[1] != 6 or not np.isfinite(twists).all():
             raise ValueError("its registration has no six numbers a frame")
-        return cls(tuple(map(tuple, twists.tolist())), dict(values["found"]))
+        return cls(tuple(map(tuple, twists.tolist())), dict(values["found"]), bool(values["with_depth"]))
