@@ -34,7 +34,7 @@ JUDGES = 3
 BLURS = (0.006, 0.003, 0.0015, 0.0015)
 """Widths of the blurs, coarse to fine, of the image's width."""
 
-OWN_BLURS = (0.0015, 0.0015)
+OWN_BLURS = (0.0015, 0.0015, 0.0015)
 
 LEAST_BLUR_PX = 0.7
 
@@ -42,9 +42,8 @@ MIN_GAIN_DB, MIN_SIGMAS = 0.5, 3.0
 """Corrections are kept where they lower other photos' error by so much, and by so many sigmas: what the model
 of light lacks is alike in all photos, and to move them all may hide a little of it."""
 
-TOLERATED_SIGMAS = 1.0
-"""Where photos were moved at all, what each has of its own has a tight prior, and stays unless judges lose by
-so
+TOLERATED_DB = 0.25
+"""Where photos were moved at all, what each has of its own has a tight prior, and stays unless judges lose so
 much: it sharpens what they are compared with, and they themselves get only its drift."""
 
 LEAST_PHOTOS = 8
@@ -107,8 +106,9 @@ class Aligner:
         after, _ = step(now, before, some, own=True)
         return _cost_db(before, look(scene, photos, after.poses, some, blur_px))
 
-    def run(self, forced: bool) -> tuple[Corrections, str, Verdict | None, bool]:
-        """The corrections, why, what the judges say of them (None: they were not asked) and whether any."""
+    def run(self, forced: bool) -> tuple[Corrections | None, str, Verdict]:
+        """The corrections (None: the photos stay), why, and what the judges say of them. If ``forced``, those
+        that all photos share are kept whatever the judges say."""
         self._read(self.frames)
         scene = Scene.of(self.surface, self.camera, VERTICES)
         none = Corrections.none(self.sequence.T_world_camera)
@@ -123,12 +123,12 @@ class Aligner:
         own = self._steps(scene, best, self.choosers, OWN_BLURS, own=True)
         more = self._errors(scene, own)
         further = more.better_than(base)
-        if _keeps(further) or (levels and further.sigmas > -TOLERATED_SIGMAS):
+        if _keeps(further) or (levels and further.gain_db > -TOLERATED_DB):
             best, levels, verdict = own, [*levels, "drift"], more.better_than(was)
         if not levels:
-            return none, f"what the photos ask for does not help others ({gained})", gained, False
+            return None, f"what the photos ask for does not help others ({gained})", gained
         best = self._steps(scene, best, self.frames, OWN_BLURS[:1], own="drift" in levels)
-        return best, f"{' and '.join(levels)}: {verdict}", verdict, True
+        return best, f"{' and '.join(levels)}: {verdict}", verdict
 
     def _steps(
         self, scene: Scene, start: Corrections, frames: np.ndarray, blurs: tuple[float, ...], own: bool
@@ -192,9 +192,9 @@ def align(twin: Twin, state: str = "auto", progress: Progress | None = None) -> 
         if asked_db < MIN_GAIN_DB / 2:
             reason = f"the photos lie on the surface: no more than {asked_db:+.2f} dB to gain"
             return decided(None, reason, None)
-    found, reason, verdict, any_ = aligner.run(state == "on")
-    registration = _registration(found) if any_ else None
-    return decided(registration, reason, None if verdict is None else round(verdict.gain_db, 3))
+    found, reason, verdict = aligner.run(state == "on")
+    registration = None if found is None else _registration(found)
+    return decided(registration, reason, round(verdict.gain_db, 3))
 
 
 def _silent(label: str, done: int, total: int) -> None:

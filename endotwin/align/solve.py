@@ -16,7 +16,7 @@ from endotwin.align.within import HUBER, ROUNDS, Within, within
 from endotwin.run.ahead import ahead
 from endotwin.run.threads import THREADS
 
-TEXTURE_ALIKE, RIM_ALIKE = 10.0, 4.0
+TEXTURE_ALIKE, RIM_ALIKE = 10.0, 2.0
 """What the model of light lacks errs alike in so many vertices, and in so many spots of the blur beside
 rims."""
 
