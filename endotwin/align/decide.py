@@ -90,7 +90,7 @@ class Aligner:
         self.surface, self.camera = twin.surface, self.sequence.camera
         self.photos: dict = {}
         self._progress = progress or _silent
-        self._looks, self._expected = 0, len(BLURS) + 2 * len(OWN_BLURS)
+        self._looks, self._expected = 0, len(BLURS) + len(OWN_BLURS) + 1
 
     def blur_px(self, share: float) -> float:
         return max(LEAST_BLUR_PX, share * self.camera.width)
@@ -114,21 +114,17 @@ class Aligner:
         none = Corrections.none(self.sequence.T_world_camera)
         was = self._errors(scene, none)
         shared = self._steps(scene, none, self.choosers, BLURS, own=False)
-        best, levels, verdict = none, [], None
         now = self._errors(scene, shared)
         gained = now.better_than(was)
-        if forced or _keeps(gained):
-            best, levels, verdict = shared, ["shared"], gained
-        base = now if levels else was
-        own = self._steps(scene, best, self.choosers, OWN_BLURS, own=True)
-        more = self._errors(scene, own)
-        further = more.better_than(base)
-        if _keeps(further) or (levels and further.gain_db > -TOLERATED_DB):
-            best, levels, verdict = own, [*levels, "drift"], more.better_than(was)
-        if not levels:
+        if not forced and not _keeps(gained):
             return None, f"what the photos ask for does not help others ({gained})", gained
-        best = self._steps(scene, best, self.frames, OWN_BLURS[:1], own="drift" in levels)
-        return best, f"{' and '.join(levels)}: {verdict}", verdict
+        own = self._steps(scene, shared, self.choosers, OWN_BLURS, own=True)
+        more = self._errors(scene, own)
+        if more.better_than(now).gain_db > -TOLERATED_DB:
+            best = self._steps(scene, own, self.frames, OWN_BLURS[:1], own=True)
+            verdict = more.better_than(was)
+            return best, f"shared and drift: {verdict}", verdict
+        return self._steps(scene, shared, self.frames, OWN_BLURS[:1], own=False), f"shared: {gained}", gained
 
     def _steps(
         self, scene: Scene, start: Corrections, frames: np.ndarray, blurs: tuple[float, ...], own: bool
