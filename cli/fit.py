@@ -53,6 +53,14 @@ def fit(
             show_default=False,
         ),
     ] = "",
+    align: Annotated[
+        str | None,
+        typer.Option(
+            metavar="auto|on|off",
+            help="Align the photos to the surface first, as 'endotwin align' does.",
+            show_default="as decided before, else auto; off under a budget",
+        ),
+    ] = None,
     seed: Annotated[int, typer.Option(metavar="N", min=0, help="Seed of all random choices.")] = 0,
     device: Annotated[
         str,
@@ -98,6 +106,7 @@ def fit(
                 seed=seed,
                 config=plan,
                 effects=states,
+                align=align,
                 progress=run.progress,
                 checkpoint=target.with_name(f".{target.name}.fit"),
                 device=device,

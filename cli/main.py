@@ -6,6 +6,7 @@ import sys
 from typing import Annotated
 
 import typer
+from endotwin.cli.align import align
 from endotwin.cli.check import check
 from endotwin.cli.effects import effects
 from endotwin.cli.eval import evaluate
@@ -29,6 +30,7 @@ app = typer.Typer(
 )
 for name, function in {
     "fuse": fuse,
+    "align": align,
     "fit": fit,
     "eval": evaluate,
     "synth": synth,
@@ -62,7 +64,8 @@ def describe(
 ) -> None:
     """Turn a posed endoscopic RGB-D sequence into a relightable twin, and the twin into labelled datasets.
 
-    The usual order: fuse, fit, eval, synth; inspect at any time. 'endotwin COMMAND --help' explains each.
+    The usual order: fuse, fit (which aligns the photos where that helps), eval, synth; inspect at any time.
+    'endotwin COMMAND --help' explains each.
     """
 
 

@@ -17,6 +17,7 @@ _HOME = {
     "Sequence": "sequence",
     "Surface": "surface",
     "Twin": "twin",
+    "align_twin": "pipeline",
     "evaluate": "evaluation",
     "fit_twin": "pipeline",
     "fuse_twin": "pipeline",

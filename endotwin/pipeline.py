@@ -105,6 +105,23 @@ def fuse_twin(
     return Twin(surface, sequence.camera, source, record={"fuse": made})
 
 
+def align_twin(twin: Twin | Path | str, state: str = "auto", *, progress: Progress | None = None) -> Twin:
+    """Align the photos of a twin's sequence to its surface; what was decided stands in ``record["align"]``.
+
+    Args:
+        twin: or its folder; what was fitted to it is lost where its photos move.
+        state: ``auto``: as far as photos that did not choose the corrections bear them out; ``on``: at least
+            what all photos share; ``off``: not at all.
+        progress: called with (label, done, total).
+
+    Raises:
+        OptionError: another state. SequenceError: the twin's sequence has moved or cannot be read.
+    """
+    from endotwin.align import align
+
+    return align(as_twin(twin), state, progress)[0]
+
+
 def fit_twin(
     twin: Twin | Path | str,
     method: str | None = None,
@@ -114,6 +131,7 @@ def fit_twin(
     seed: int = 0,
     config: FitConfig = STANDARD.fit,
     effects: Mapping[str, str] | None = None,
+    align: str | None = None,
     progress: Progress | None = None,
     checkpoint: Path | None = None,
     device: str = "cpu",
@@ -128,6 +146,8 @@ def fit_twin(
         seed: of all random choices.
         config: how much work to do.
         effects: auto, on or off by name of the effect (see ``endotwin.effects.NAMES``); auto unless named.
+        align: auto, on or off, as of ``align_twin``. Unless given, what was decided about the twin before
+            holds, and else auto; but off under a budget, or for ``endopbr``.
         progress: called with (label, done, total).
         checkpoint: file from which a stopped ``endopbr`` goes on; it is removed at the end.
         device: cpu, cuda, or auto for a GPU where there is one.
@@ -140,6 +160,9 @@ def fit_twin(
             _check_positive(name, value)
     twin = as_twin(twin)
     config = replace(config, method=method or config.method, budget=budget_s or config.budget)
+    undecided = "align" not in twin.record and config.method == "twin" and config.budget is None
+    if align is not None or undecided:
+        twin = align_twin(twin, align or "auto", progress=progress)
     return fit(twin, config, epochs, seed, progress, checkpoint, effects, priced, device)
 
 

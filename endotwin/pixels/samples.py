@@ -20,7 +20,7 @@ from endotwin.pixels.pace import Pace
 from endotwin.run.ahead import ahead
 from endotwin.run.threads import THREADS
 from endotwin.sequence import Frame
-from endotwin.surface.casting import Caster
+from endotwin.surface.casting import Caster, Correspondences
 from endotwin.surface.silhouettes import discontinuities
 from endotwin.twin import Twin
 
@@ -144,9 +144,8 @@ def gather(twin: Twin, pace: Pace, seed: int, caster: Caster) -> Samples:
     """About ``pace.pixels`` pixels, or all, drawn evenly from what its photos show of the surface.
 
     A pixel counts if it lies within the lens circle, has a depth, lies off depth discontinuities, and its
-    ray meets
-    the surface at that depth. A photo that is all black or clipped is left out with a warning, unless all
-    are.
+    ray meets the surface at that depth, unless the photos were aligned apart from their depth maps. A photo
+    that is all black or clipped is left out with a warning, unless all are.
     """
     sequence = twin.sequence()
     frames = twin.source.training(len(sequence))
@@ -188,14 +187,16 @@ def frame_samples(
     share: float,
     generator: np.random.Generator,
 ) -> Samples:
-    chosen = lens_mask & np.isfinite(frame.depth_mm) & ~discontinuities(frame.depth_mm)
-    if share < 1:
-        chosen &= generator.random(chosen.shape, np.float32) < share
-    hits = caster.cast(twin.camera, frame.T_world_camera, chosen)
-    depth_mm = frame.depth_mm.reshape(-1)[hits.pixel]
-    cast_mm = hits.distance_mm * twin.camera.pixel_directions.reshape(-1, 3)[hits.pixel, 2]
-    least_mm = unit_mm(twin.surface) * DEPTH_TOLERANCE_MM
-    hits = hits[np.abs(cast_mm - depth_mm) <= np.maximum(least_mm, DEPTH_TOLERANCE * depth_mm)]
+    chosen = lens_mask & np.isfinite(frame.depth_mm)
+    if twin.registration is None or twin.registration.with_depth:
+        chosen &= ~discontinuities(frame.depth_mm)
+        if share < 1:
+            chosen &= generator.random(chosen.shape, np.float32) < share
+        hits = caster.cast(twin.camera, frame.T_world_camera, chosen)
+        hits = hits[_at_depth(hits, frame.depth_mm, twin)]
+    else:
+        hits = _off_rims(caster.cast(twin.camera, frame.T_world_camera, chosen), chosen.shape)
+        hits = hits[generator.random(len(hits), np.float32) < share]
     geometry = incidence(hits, twin.surface, twin.camera, frame.T_world_camera)
     return Samples(
         triangle=torch.from_numpy(hits.triangle.astype(np.int64)),
@@ -205,3 +206,19 @@ def frame_samples(
         pixel=torch.from_numpy(hits.pixel.astype(np.int32)),
         **{name: torch.from_numpy(value) for name, value in vars(geometry).items()},
     )
+
+
+def _at_depth(hits: Correspondences, depth_mm: np.ndarray, twin: Twin) -> np.ndarray:
+    """Bool [N]: hits that lie at the measured depth [H, W] of their pixel."""
+    measured_mm = depth_mm.reshape(-1)[hits.pixel]
+    cast_mm = hits.distance_mm * twin.camera.pixel_directions.reshape(-1, 3)[hits.pixel, 2]
+    least_mm = unit_mm(twin.surface) * DEPTH_TOLERANCE_MM
+    return np.abs(cast_mm - measured_mm) <= np.maximum(least_mm, DEPTH_TOLERANCE * measured_mm)
+
+
+def _off_rims(hits: Correspondences, shape: tuple[int, int]) -> Correspondences:
+    """Hits off the silhouettes that they themselves show: a photo that was aligned is not where its depth map
+    is."""
+    distance_mm = np.zeros(shape[0] * shape[1], np.float32)
+    distance_mm[hits.pixel] = hits.distance_mm
+    return hits[~discontinuities(distance_mm.reshape(shape)).reshape(-1)[hits.pixel]]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -144,6 +145,28 @@ def write_c3vd_poses(path: Path, T_world_camera: np.ndarray) -> None:
     """Write poses [N, 4, 4] as a C3VD ``pose.txt``, in digits that read back to the same float64."""
     rows = np.asarray(T_world_camera, np.float64).transpose(0, 2, 1).reshape(-1, 16).tolist()
     path.write_text("".join(",".join(map(repr, row)) + "\n" for row in rows), encoding="utf-8")
+
+
+def write_tum_poses(path: Path, T_world_camera: np.ndarray, timestamps_s: np.ndarray) -> None:
+    """Write poses [N, 4, 4] in mm with timestamps [N] as a TUM trajectory, in metres."""
+    quaternions = Rotation.from_matrix(T_world_camera[:, :3, :3]).as_quat(canonical=True)
+    rows = np.c_[timestamps_s, T_world_camera[:, :3, 3] / MM_PER_UNIT["m"], quaternions].tolist()
+    lines = ["# timestamp tx ty tz qx qy qz qw", *(" ".join(map(repr, row)) for row in rows)]
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def write_transforms_poses(path: Path, T_world_camera: np.ndarray, source: Path) -> None:
+    """Write the ``transforms.json`` at ``source`` again, with poses [N, 4, 4] in mm, in order of names."""
+    content = read_json(source)
+    poses = T_world_camera @ AXES_OPENGL_OPENCV
+    poses[:, :3, 3] /= transforms_unit_mm(content, source)
+    _, frames = read_transforms_poses(source)
+    named = {
+        str(frame.get("file_path", "")): pose.tolist() for frame, pose in zip(frames, poses, strict=True)
+    }
+    for frame in content["frames"]:
+        frame["transform_matrix"] = named[str(frame.get("file_path", ""))]
+    path.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
 
 
 def read_tum_poses(path: Path) -> tuple[np.ndarray, np.ndarray]:

@@ -62,7 +62,7 @@ def render(folder: Path, patch: Patch) -> np.ndarray:
     from endotwin.render import Renderer
 
     twin = Twin.load(folder).at_scale(1.0)
-    sequence = twin.source.open()
+    sequence = twin.sequence()
     mask = np.zeros((twin.camera.height, twin.camera.width), bool)
     patch.of(mask)[...] = True
     view = Renderer(twin).view(sequence.T_world_camera[patch.frame], mask)

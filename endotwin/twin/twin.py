@@ -26,6 +26,7 @@ from endotwin.sequence import Sequence, Split
 from endotwin.sequence.readers import open_sequence
 from endotwin.surface import Surface
 from endotwin.twin import meshes
+from endotwin.twin.registration import Registration
 from endotwin.twin.soundness import require_sound
 
 if TYPE_CHECKING:
@@ -166,6 +167,7 @@ class Twin:
         materials, light, response: None until ``fit``.
         record: how the twin was made: options, seconds of each stage, scores.
         effects: what it has beside the paper's light and materials. decisions: why, by name of the effect.
+        registration: corrections of the photos' poses; None: they are where the sequence says.
     """
 
     surface: Surface
@@ -177,6 +179,7 @@ class Twin:
     record: dict = field(default_factory=dict)
     effects: Effects = field(default_factory=Effects)
     decisions: dict[str, Decision] = field(default_factory=dict)
+    registration: Registration | None = None
 
     @property
     def fitted(self) -> bool:
@@ -214,7 +217,8 @@ class Twin:
         return replace(self, source=source, camera=source.open().camera)
 
     def sequence(self) -> Sequence:
-        """The sequence that the twin was made from; raises SequenceError if it is gone or of another size."""
+        """The sequence that the twin was made from, its photos where they were aligned to; raises
+        SequenceError if it is gone or of another size."""
         sequence = self.source.open()
         sizes = [f"{camera.width}×{camera.height}" for camera in (sequence.camera, self.camera)]
         if sizes[0] != sizes[1]:
@@ -222,7 +226,7 @@ class Twin:
                 f"{self.source.path} has frames of {sizes[0]} at the twin's scale, but the twin was made "
                 f"from {sizes[1]}; make it again with 'endotwin fuse'"
             )
-        return sequence
+        return sequence if self.registration is None else self.registration.applied(sequence)
 
     def render(self, T_world_camera: np.ndarray, camera: Camera | None = None) -> View:
         """The view from a pose: what the photo taken there would look like, with its labels.
@@ -305,6 +309,8 @@ class Twin:
             "decisions": {name: asdict(decision) for name, decision in self.decisions.items()},
             "record": self.record,
         }
+        if self.registration is not None:
+            document["registration"] = self.registration.to_dict()
         return {**document, "seal": _seal(document)}
 
     @classmethod
@@ -330,6 +336,9 @@ class Twin:
                 record=document["record"],
                 effects=Effects.from_dict(document.get("effects", {})),
                 decisions=_read_decisions(path, document),
+                registration=Registration.from_dict(moved)
+                if (moved := document.get("registration"))
+                else None,
             )
             return require_sound(twin)
         except FileNotFoundError as error:

@@ -15,7 +15,7 @@ from endotwin.twin import Twin
 def recorded_poses(twin: Twin) -> tuple[np.ndarray | None, str]:
     """Poses [N, 4, 4] of the twin's sequence, or None and the reason why there are none."""
     try:
-        return twin.source.open().T_world_camera, ""
+        return twin.sequence().T_world_camera, ""
     except SequenceError:
         return None, f"no camera path: {Path(twin.source.path).name} is not where it was"
 

@@ -1,0 +1,5 @@
+"""Photos registered to the surface, only as far as photos prove it."""
+
+from endotwin.align.decide import STATES, Alignment, align
+
+__all__ = ["STATES", "Alignment", "align"]

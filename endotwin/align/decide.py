@@ -1,0 +1,222 @@
+"""From a twin's surface to corrections of its photos' poses, as far as other photos bear them out."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from endotwin.align import depths
+from endotwin.align.corrections import Corrections
+from endotwin.align.judge import Errors, Verdict, errors
+from endotwin.align.photos import read_photos
+from endotwin.align.scene import Scene
+from endotwin.align.solve import Looked, look, step
+from endotwin.errors import OptionError
+from endotwin.sequence import Sequence
+from endotwin.twin import Registration, Twin
+
+STATES = ("auto", "on", "off")
+
+WIDTH = 675
+"""Photos are looked at in at most this width: a tenth of a pixel there is a few micrometres of tissue."""
+
+PHOTOS, VERTICES = 72, 15_000
+"""At most so many photos, evenly spread, choose and judge; so many vertices are looked at."""
+
+GLANCE_PHOTOS, GLANCE_VERTICES = 12, 6_000
+
+JUDGES = 3
+"""Every third photo judges what the others choose."""
+
+BLURS = (0.006, 0.003, 0.0015, 0.0015)
+"""Widths of the blurs, coarse to fine, of the image's width."""
+
+OWN_BLURS = (0.0015, 0.0015, 0.0015)
+
+LEAST_BLUR_PX = 0.7
+
+MIN_GAIN_DB, MIN_SIGMAS = 0.5, 3.0
+"""Corrections are kept where they lower other photos' error by so much, and by so many sigmas: what the model
+of light lacks is alike in all photos, and to move them all may hide a little of it."""
+
+TOLERATED_DB = 0.25
+"""Where photos were moved at all, what each has of its own has a tight prior, and stays unless judges lose so
+much: it sharpens what they are compared with, and they themselves get only its drift."""
+
+LEAST_PHOTOS = 8
+"""Fewer can neither choose nor judge."""
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """What was decided, and why.
+
+    Attributes:
+        registration: the corrections; None: the photos stay. reason: in a line. gain_db: what judging photos
+            gained; None where none judged. seconds: what it took.
+    """
+
+    registration: Registration | None
+    reason: str
+    gain_db: float | None
+    seconds: float
+
+    def to_dict(self) -> dict:
+        """Plain values for a twin's record."""
+        found = self.registration.found if self.registration else {}
+        return {"reason": self.reason, "gain_db": self.gain_db, "seconds": self.seconds, **found}
+
+
+Progress = Callable[[str, int, int], None]
+
+
+class Aligner:
+    """One search for corrections.
+
+    Attributes:
+        frames: int [F], the photos that take part; ``choosers`` and ``judges`` among them.
+    """
+
+    def __init__(self, twin: Twin, progress: Progress | None):
+        scale = min(1.0, WIDTH / twin.camera.width) * twin.source.scale
+        self.sequence: Sequence = replace(twin.source, scale=scale).open()
+        training = np.array(twin.source.training(len(self.sequence)))
+        self.frames = training[np.unique(np.linspace(0, len(training) - 1, PHOTOS).round().astype(int))]
+        judging = np.arange(len(self.frames)) % JUDGES == JUDGES // 2
+        self.choosers, self.judges = self.frames[~judging], self.frames[judging]
+        self.surface, self.camera = twin.surface, self.sequence.camera
+        self.photos: dict = {}
+        self._progress = progress or _silent
+        self._looks, self._expected = 0, len(BLURS) + len(OWN_BLURS) + 1
+
+    def blur_px(self, share: float) -> float:
+        return max(LEAST_BLUR_PX, share * self.camera.width)
+
+    def asked_db(self) -> float:
+        """By how much the photos' error would fall at a glance, if all were granted that some of them ask
+        for."""
+        some = self.frames[np.unique(np.linspace(0, len(self.frames) - 1, GLANCE_PHOTOS).round().astype(int))]
+        scene = Scene.of(self.surface, self.camera, GLANCE_VERTICES)
+        now, blur_px = Corrections.none(self.sequence.T_world_camera), self.blur_px(BLURS[1])
+        photos = self._read(some)
+        before = look(scene, photos, now.poses, some, blur_px)
+        after, _ = step(now, before, some, own=True)
+        return _cost_db(before, look(scene, photos, after.poses, some, blur_px))
+
+    def run(self, forced: bool) -> tuple[Corrections | None, str, Verdict]:
+        """The corrections (None: the photos stay), why, and what the judges say of them. If ``forced``, those
+        that all photos share are kept whatever the judges say."""
+        self._read(self.frames)
+        scene = Scene.of(self.surface, self.camera, VERTICES)
+        none = Corrections.none(self.sequence.T_world_camera)
+        was = self._errors(scene, none)
+        shared = self._steps(scene, none, self.choosers, BLURS, own=False)
+        now = self._errors(scene, shared)
+        gained = now.better_than(was)
+        if not forced and not _keeps(gained):
+            return None, f"what the photos ask for does not help others ({gained})", gained
+        own = self._steps(scene, shared, self.choosers, OWN_BLURS, own=True)
+        more = self._errors(scene, own)
+        if more.better_than(now).gain_db > -TOLERATED_DB:
+            best = self._steps(scene, own, self.frames, OWN_BLURS[:1], own=True)
+            verdict = more.better_than(was)
+            return best, f"shared and drift: {verdict}", verdict
+        return self._steps(scene, shared, self.frames, OWN_BLURS[:1], own=False), f"shared: {gained}", gained
+
+    def _steps(
+        self, scene: Scene, start: Corrections, frames: np.ndarray, blurs: tuple[float, ...], own: bool
+    ) -> Corrections:
+        now = start
+        for share in blurs:
+            told = look(scene, self.photos, now.poses, frames, self.blur_px(share))
+            now, _ = step(now, told, frames, own)
+            self._looks += 1
+            self._progress("align", min(self._looks, self._expected), self._expected)
+        return now
+
+    def _errors(self, scene: Scene, now: Corrections) -> Errors:
+        blur_px = self.blur_px(BLURS[-1])
+        return errors(scene, self.photos, now.poses, self.choosers, self.judges, blur_px)
+
+    def _read(self, frames: np.ndarray) -> dict:
+        missing = [frame for frame in frames.tolist() if frame not in self.photos]
+        self.photos.update(read_photos(self.sequence, missing))
+        return self.photos
+
+
+def align(twin: Twin, state: str = "auto", progress: Progress | None = None) -> tuple[Twin, Alignment]:
+    """The twin with its photos aligned to its surface, and what was decided.
+
+    Args:
+        twin: what was fitted to it before is lost where its photos move.
+        state: ``auto``: corrections that photos which did not choose them bear out; ``on``: those that all
+            photos share in any case; ``off``: none.
+        progress: called with (label, done, total).
+
+    Raises:
+        OptionError: another state. SequenceError: the photos cannot be read.
+    """
+    if state not in STATES:
+        raise OptionError(f"align is {state!r}; choose one of: {', '.join(STATES)}")
+    began = time.perf_counter()
+
+    def decided(registration: Registration | None, reason: str, gain_db: float | None):
+        seconds = round(time.perf_counter() - began, 2)
+        alignment = Alignment(registration, reason, gain_db, seconds)
+        moved = replace(twin, registration=registration)
+        if registration is not None:
+            moved = replace(moved, materials=None, light=None, response=None, decisions={})
+        return moved.with_record(align=alignment.to_dict()), alignment
+
+    if state == "off":
+        return decided(None, "forced off", None)
+    sequence = twin.source.open()
+    if len(twin.source.training(len(sequence))) < LEAST_PHOTOS:
+        return decided(None, "too few photos to choose and to judge", None)
+    depth_db = depths.gain_db(twin, sequence)
+    if depth_db >= depths.MIN_GAIN_DB:
+        surface, found = depths.registered(twin, sequence, progress or _silent)
+        twin = replace(twin, surface=surface)
+        reason = f"depth maps, which agree better by {depth_db:.1f} dB once each may move with its photo"
+        return decided(_registration(found, with_depth=True), reason, None)
+    aligner = Aligner(twin, progress)
+    if state == "auto":
+        asked_db = aligner.asked_db()
+        if asked_db < MIN_GAIN_DB / 2:
+            reason = f"the photos lie on the surface: no more than {asked_db:+.2f} dB to gain"
+            return decided(None, reason, None)
+    found, reason, verdict = aligner.run(state == "on")
+    registration = None if found is None else _registration(found)
+    return decided(registration, reason, round(verdict.gain_db, 3))
+
+
+def _silent(label: str, done: int, total: int) -> None:
+    """Nobody watches."""
+
+
+def _keeps(verdict: Verdict) -> bool:
+    return verdict.gain_db >= MIN_GAIN_DB and verdict.sigmas >= MIN_SIGMAS
+
+
+def _cost_db(before: Looked, after: Looked) -> float:
+    """By how much the robust widths of texture fell, dB."""
+    return 20 * float(np.log10(before.texture.width / after.texture.width))
+
+
+def _registration(found: Corrections, with_depth: bool = False) -> Registration:
+    norm, shared = np.linalg.norm, found.shared
+    own = np.sqrt((found.own**2).mean(axis=0))
+    named = {
+        "model_mm": norm(shared[3:6]),
+        "model_deg": np.degrees(norm(shared[:3])),
+        "hand_eye_mm": norm(shared[9:12]),
+        "hand_eye_deg": np.degrees(norm(shared[6:9])),
+        "lag_frames": shared[12],
+        "own_mm": norm(own[3:]),
+        "own_deg": np.degrees(norm(own[:3])),
+    }
+    named = {name: round(float(value), 4) for name, value in named.items()}
+    return Registration(tuple(map(tuple, found.twists.tolist())), named, with_depth)

@@ -1,0 +1,105 @@
+"""Where photos show the rims of folds: what geometry alone predicts, and no albedo can follow.
+
+A rim is where one pixel sees two surfaces. Beside it the photo is compared with the twin, painted with albedo
+that is even over millimetres; each side of a stretch of rim may be brighter or darker than predicted. What
+remains is the place of the step between them, and that step moves with the nearer surface.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from scipy.spatial import cKDTree
+
+from endotwin.align.photos import DARKEST, Photo, gradient, log_blurred
+from endotwin.align.scene import LEAST_COSINE, Scene, by_twist, dilated, shading_columns
+from endotwin.light.incidence import incidence
+from endotwin.surface.silhouettes import discontinuities
+
+BAND_SIGMAS = 2.5
+"""A rim shows within so many widths of the blur."""
+
+STRETCH_CELLS = 24
+"""Cells across the image, in each of which either side of a rim has a brightness of its own."""
+
+FARTHER = 1.05
+"""A pixel is on the far side of a rim if it lies so much farther than what is near beside it."""
+
+PAINT_MM = 2.5
+NEIGHBOURS = 3
+
+
+class Paint:
+    """ln of the albedo of cells of PAINT_MM, from ``log_albedo`` [V] at local ``points_mm`` [V, 3]."""
+
+    def __init__(self, points_mm: np.ndarray, log_albedo: np.ndarray, cell_mm: float = PAINT_MM):
+        cells = np.floor(points_mm / cell_mm).astype(np.int64)
+        _, group, count = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
+        group = group.reshape(-1)
+        self._level = np.bincount(group, log_albedo) / count
+        self._tree = cKDTree(np.stack([np.bincount(group, x) / count for x in points_mm.T], axis=1))
+
+    def at(self, points_mm: np.ndarray) -> np.ndarray:
+        """[N], at local points [N, 3]."""
+        distance_mm, which = self._tree.query(
+            points_mm, k=list(range(1, 1 + min(NEIGHBOURS, len(self._level)))), workers=2
+        )
+        weight = 1 / (distance_mm + PAINT_MM / 8) ** 2
+        return (self._level[which] * weight).sum(axis=1) / weight.sum(axis=1)
+
+
+@dataclass(frozen=True)
+class Rim:
+    """P pixels beside rims in one photo.
+
+    Attributes:
+        residual: float64 [P], ln photo − ln twin. slopes: [P, 6], of it by the camera's twist.
+        stretch: int [P], side and stretch of rim, numbered without gaps.
+    """
+
+    residual: np.ndarray
+    slopes: np.ndarray
+    stretch: np.ndarray
+
+
+def rim(
+    scene: Scene, photo: Photo, T_world_camera: np.ndarray, sigma_px: float, paint: Paint, light: np.ndarray
+) -> Rim:
+    """Rims in a photo from ``T_world_camera`` [4, 4], blurred by ``sigma_px``, under ``light`` [6]."""
+    (height, width), reach = scene.shape, int(np.ceil(BAND_SIGMAS * sigma_px))
+    hits = scene.caster.cast(scene.camera, T_world_camera)
+    distances = scene.distances(hits)
+    inside = ~dilated(distances == 0, 1)
+    band = dilated(discontinuities(distances) & inside, reach)
+    hits = hits[dilated(band, reach).reshape(-1)[hits.pixel]]
+    twin, met = np.zeros(height * width, np.float32), np.zeros(height * width, np.float32)
+    twin[hits.pixel], met[hits.pixel] = _shaded(scene, hits, T_world_camera, paint, light), 1
+    twin, met = twin.reshape(height, width), met.reshape(height, width)
+
+    shown, holds = photo.blurred(sigma_px, met)
+    predicted, told = log_blurred(twin, met * photo.shown, sigma_px)
+    pixel = np.flatnonzero(band & holds & told & (predicted > np.log(DARKEST)))
+    slopes_uv = [slope.reshape(-1)[pixel].astype(np.float64) for slope in gradient(predicted)]
+    beyond = np.where(distances > 0, distances, np.inf).astype(np.float32)
+    nearest = cv2.erode(beyond, np.ones((2 * reach + 1,) * 2, np.uint8)).reshape(-1)[pixel].astype(np.float64)
+    points = scene.rays[pixel].astype(np.float64) * nearest[:, None]
+    slopes = by_twist(scene.by_point(pixel, *slopes_uv, points), points)
+    far = distances.reshape(-1)[pixel] > FARTHER * nearest
+    cell_px = width / STRETCH_CELLS
+    v, u = ((x / cell_px).astype(int) for x in np.divmod(pixel, width))
+    stretch = np.unique((v * (STRETCH_CELLS + 1) + u) * 2 + far, return_inverse=True)[1].reshape(-1)
+    residual = (shown - predicted).reshape(-1)[pixel].astype(np.float64)
+    return Rim(residual, slopes, stretch)
+
+
+def _shaded(scene: Scene, hits, T_world_camera: np.ndarray, paint: Paint, light: np.ndarray) -> np.ndarray:
+    """Display value [N] of hits under ``light`` [6]."""
+    lit = incidence(hits, scene.surface, scene.camera, T_world_camera)
+    ray = scene.rays[hits.pixel]
+    T = scene.surface.to_local(T_world_camera)
+    points = (ray * hits.distance_mm[:, None]) @ T[:3, :3].T + T[:3, 3]
+    r2 = scene.squared_radius(np.stack([hits.pixel % scene.shape[1], hits.pixel // scene.shape[1]], axis=1))
+    columns = shading_columns(ray[:, 2], hits.distance_mm, np.maximum(lit.cos, LEAST_COSINE), r2)
+    return np.exp(paint.at(points) + columns @ light)

@@ -1,0 +1,103 @@
+"""Gauss–Newton on the corrections: texture says how photos lie to each other, rims how they lie to the
+surface."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.linalg
+
+from endotwin.align.corrections import SHARED, Corrections, own_covariance, own_spread, shared_spread
+from endotwin.align.photos import Photo
+from endotwin.align.rims import Paint, Rim, rim
+from endotwin.align.scene import Scene
+from endotwin.align.within import HUBER, ROUNDS, Within, within
+from endotwin.run.ahead import ahead
+from endotwin.run.threads import THREADS
+
+TEXTURE_ALIKE, RIM_ALIKE = 10.0, 2.0
+"""What the model of light lacks errs alike in so many vertices, and in so many spots of the blur beside
+rims."""
+
+
+@dataclass(frozen=True, eq=False)
+class Looked:
+    """What F photos tell at one state of the corrections: matrix [F, 6, F, 6] and right-hand side [F, 6]; and
+    the terms that they came from."""
+
+    matrix: np.ndarray
+    right: np.ndarray
+    texture: Within
+    rims: list[Rim]
+
+
+def paint_of(scene: Scene, texture: Within) -> Paint:
+    known = np.isfinite(texture.log_albedo)
+    return Paint(scene.points_mm[known], texture.log_albedo[known])
+
+
+def look(
+    scene: Scene, photos: dict[int, Photo], poses: np.ndarray, frames: np.ndarray, sigma_px: float
+) -> Looked:
+    """What the photos of ``frames`` [F] tell about their ``poses`` [N, 4, 4], blurred by ``sigma_px``."""
+    texture = within(scene, photos, poses, frames, sigma_px)
+    paint = paint_of(scene, texture)
+    found = ahead(
+        lambda f: rim(scene, photos[f], poses[f], sigma_px, paint, texture.light), frames.tolist(), THREADS
+    )
+    matrix, right = texture.normal_equations(len(frames))
+    matrix, right = matrix / TEXTURE_ALIKE, right / TEXTURE_ALIKE
+    alike = RIM_ALIKE * 4 * np.pi * sigma_px**2
+    rims = list(found)
+    for number, seen in enumerate(rims):
+        own, pull = rim_equations(seen)
+        matrix[number, :, number] += own / alike
+        right[number] += pull / alike
+    return Looked(matrix, right, texture, rims)
+
+
+def rim_equations(seen: Rim) -> tuple[np.ndarray, np.ndarray]:
+    """Matrix [6, 6] and right-hand side [6] of a photo's twist, in units of the residuals' variance."""
+    if len(seen.residual) < 100:
+        return np.zeros((6, 6)), np.zeros(6)
+    left, weight, width = even(seen)
+    total = np.bincount(seen.stretch, weight)
+    slopes = seen.slopes - np.stack(
+        [(np.bincount(seen.stretch, weight * x) / total)[seen.stretch] for x in seen.slopes.T], axis=1
+    )
+    weighted = slopes * weight[:, None]
+    return weighted.T @ slopes / width**2, -weighted.T @ left / width**2
+
+
+def even(seen: Rim) -> tuple[np.ndarray, np.ndarray, float]:
+    """A rim's residuals [P] less the mean of each stretch, their weights [P] and width."""
+    weight = np.ones(len(seen.residual))
+    for _ in range(ROUNDS):
+        mean = np.bincount(seen.stretch, weight * seen.residual) / np.bincount(seen.stretch, weight)
+        left = seen.residual - mean[seen.stretch]
+        width = max(1.4826 * float(np.median(np.abs(left))), 1e-3)
+        weight = 1 / np.maximum(1, np.abs(left) / (HUBER * width))
+    return left, weight, width
+
+
+def step(now: Corrections, told: Looked, frames: np.ndarray, own: bool) -> tuple[Corrections, np.ndarray]:
+    """The corrections after a Gauss–Newton step, and the standard deviations of the shared ones [13]; what
+    the photos of ``frames`` [F] have of their own moves if ``own`` says so."""
+    count = len(frames)
+    flat = told.matrix.reshape(6 * count, 6 * count)
+    shared = now.slopes()[frames].reshape(6 * count, SHARED)
+    to_twists = np.hstack([shared, np.eye(6 * count)]) if own else shared
+    precision = np.diag(1 / shared_spread() ** 2)
+    before = now.shared
+    if own:
+        kernel = np.linalg.inv(own_covariance(frames))
+        precision = scipy.linalg.block_diag(precision, np.kron(kernel, np.diag(1 / own_spread() ** 2)))
+        before = np.r_[before, now.own[frames].reshape(-1)]
+    normal = to_twists.T @ flat @ to_twists + precision
+    right = to_twists.T @ told.right.reshape(-1) - precision @ before
+    factor = scipy.linalg.cho_factor(normal)
+    found = scipy.linalg.cho_solve(factor, right)
+    spread = np.sqrt(np.diag(scipy.linalg.cho_solve(factor, np.eye(len(normal))))[:SHARED])
+    moved = found[SHARED:].reshape(count, 6) if own else np.zeros((count, 6))
+    return now.stepped(found[:SHARED], moved, frames), spread

@@ -1,0 +1,131 @@
+"""The vertices' sightings in many photos, with every vertex's albedo and every image's smooth light taken
+out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from endotwin.align.photos import Photo
+from endotwin.align.scene import SHADING, SHADING_MEAN, SHADING_SPREAD, Scene
+from endotwin.align.texture import LIGHT_CELLS, sighted
+from endotwin.run.ahead import ahead
+from endotwin.run.threads import THREADS
+
+HUBER = 2.0
+ROUNDS = 4
+"""Of reweighting, and of taking out vertices' and cells' means in turn."""
+
+CHUNK = 2000
+"""Vertices whose sightings are multiplied at a time."""
+
+
+@dataclass(frozen=True, eq=False)
+class Within:
+    """N sightings in F photos.
+
+    Attributes:
+        vertex, photo, cell: int [N]; ``cell`` counts those of all photos. slopes: float32 [N, 6].
+        residual: float64 [N], ln photo less shading, vertex and cell. weight: [N], at most 1. width: of the
+            residuals. light: [6], coefficients of the shading. log_albedo: [V], of the scene's vertices, NaN
+            unseen.
+    """
+
+    vertex: np.ndarray
+    photo: np.ndarray
+    cell: np.ndarray
+    slopes: np.ndarray
+    residual: np.ndarray
+    weight: np.ndarray
+    width: float
+    light: np.ndarray
+    log_albedo: np.ndarray
+
+    def normal_equations(self, count: int) -> tuple[np.ndarray, np.ndarray]:
+        """Matrix [F, 6, F, 6] and right-hand side [F, 6] of the twists of ``count`` photos, in units of the
+        residuals' variance."""
+        weighted = self.slopes * self.weight[:, None]
+        own = np.zeros((count, 6, 6))
+        right = np.stack([-np.bincount(self.photo, x * self.residual, count) for x in weighted.T], axis=1)
+        bounds = np.searchsorted(self.photo, np.arange(count + 1))
+        for number, (start, stop) in enumerate(pairwise(bounds)):
+            own[number] = weighted[start:stop].T @ self.slopes[start:stop]
+        full = np.zeros((count, 6, count, 6))
+        full[np.arange(count), :, np.arange(count)] = own
+        full = full.reshape(6 * count, 6 * count)
+        total = np.bincount(self.vertex, self.weight, len(self.log_albedo))
+        order = np.argsort(self.vertex, kind="stable")
+        starts = np.arange(0, len(total), CHUNK)
+        edges = np.searchsorted(self.vertex[order], np.r_[starts, len(total)])
+        for start, low, high in zip(starts, edges[:-1], edges[1:], strict=True):
+            rows = order[low:high]
+            sums = np.zeros((min(CHUNK, len(total) - start), count, 6), np.float32)
+            sums[self.vertex[rows] - start, self.photo[rows]] = weighted[rows]
+            sums /= np.sqrt(np.maximum(total[start : start + CHUNK], 1e-9))[:, None, None]
+            flat = sums.reshape(len(sums), -1)
+            full -= flat.T @ flat
+        return full.reshape(count, 6, count, 6) / self.width**2, right / self.width**2
+
+
+def within(
+    scene: Scene, photos: dict[int, Photo], poses: np.ndarray, frames: np.ndarray, sigma_px: float
+) -> Within:
+    """Sightings in the photos of ``frames`` [F], whose poses are ``poses`` [N, 4, 4] by frame."""
+    seen = list(ahead(lambda f: sighted(scene, photos[f], poses[f], sigma_px), frames.tolist(), THREADS))
+    photo = np.repeat(np.arange(len(seen)), [len(part.vertex) for part in seen])
+    vertex = np.concatenate([part.vertex for part in seen])
+    often = np.bincount(vertex, minlength=len(scene.vertices))[vertex] > 1
+    cells = photo * (LIGHT_CELLS + 1) ** 2 + np.concatenate([part.cell for part in seen])
+    cell = np.unique(cells, return_inverse=True)[1].reshape(-1)
+    shown, columns = (np.concatenate([getattr(part, name) for part in seen]) for name in ("shown", "columns"))
+    groups = _Groups(vertex, cell, len(scene.vertices))
+    light, weight, width, residual = _explained(shown, columns, groups, often)
+    seen_weight = np.bincount(vertex, weight, groups.vertices)
+    with np.errstate(invalid="ignore"):
+        log_albedo = np.bincount(vertex, weight * (shown - columns @ light), groups.vertices) / seen_weight
+    slopes = np.concatenate([part.slopes(light) for part in seen])
+    slopes = np.stack([x - groups.of_cells(x, weight)[cell] for x in slopes.T], axis=1).astype(np.float32)
+    weight = np.where(often, weight, 0.0)
+    return Within(vertex, photo, cell, slopes, residual, weight, width, light, log_albedo)
+
+
+@dataclass(frozen=True)
+class _Groups:
+    """Sightings by vertex and by cell, int [N] each."""
+
+    vertex: np.ndarray
+    cell: np.ndarray
+    vertices: int
+
+    def of_cells(self, values: np.ndarray, weight: np.ndarray) -> np.ndarray:
+        """Weighted means of the cells, [C]."""
+        return np.bincount(self.cell, weight * values) / np.maximum(np.bincount(self.cell, weight), 1e-9)
+
+    def without(self, values: np.ndarray, weight: np.ndarray) -> np.ndarray:
+        """``values`` [N, K] less what vertices and cells explain, by turns."""
+        found = values.copy()
+        by_vertex = np.maximum(np.bincount(self.vertex, weight, self.vertices), 1e-9)
+        for column in found.T:
+            for _ in range(ROUNDS):
+                column -= self.of_cells(column, weight)[self.cell]
+                column -= (np.bincount(self.vertex, weight * column, self.vertices) / by_vertex)[self.vertex]
+        return found
+
+
+def _explained(shown: np.ndarray, columns: np.ndarray, groups: _Groups, often: np.ndarray):
+    """Coefficients of the shading [6], weights [N], robust width, and residuals [N] without vertices and
+    cells."""
+    weight, light = np.ones(len(shown)), SHADING_MEAN
+    for _ in range(2):
+        left = groups.without(np.c_[columns, shown], weight)
+        a, r = left[:, :SHADING], left[:, SHADING]
+        width = max(1.4826 * float(np.median(np.abs((r - a @ light)[often]))), 1e-3) if often.any() else 1.0
+        normal = (a * weight[:, None]).T @ a / width**2 + np.diag(1 / SHADING_SPREAD**2)
+        right = a.T @ (weight * r) / width**2 + SHADING_MEAN / SHADING_SPREAD**2
+        light = np.linalg.solve(normal, right)
+        residual = r - a @ light
+        width = max(1.4826 * float(np.median(np.abs(residual[often]))), 1e-3) if often.any() else 1.0
+        weight = 1 / np.maximum(1, np.abs(residual) / (HUBER * width))
+    return light, weight, width, residual

@@ -1,0 +1,28 @@
+"""Corrected poses as a file that other tools read."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from endotwin.run.output import whole_file
+from endotwin.sequence import Sequence
+from endotwin.sequence.poses import write_c3vd_poses, write_transforms_poses, write_tum_poses
+
+TRANSFORMS = "transforms.json"
+
+
+def write_poses(path: Path, sequence: Sequence, overwrite: bool = False) -> None:
+    """Write the poses of ``sequence`` in its own format: C3VD's rows, a ``transforms.json``, or a TUM
+    trajectory, which also stands for SimCol3D's two files.
+
+    Raises:
+        OutputError: ``path`` exists or cannot be written.
+    """
+    with whole_file(Path(path), overwrite) as file:
+        if sequence.format == "c3vd":
+            write_c3vd_poses(file, sequence.T_world_camera)
+        elif sequence.format == "transforms":
+            source = sequence.path if sequence.path.is_file() else sequence.path / TRANSFORMS
+            write_transforms_poses(file, sequence.T_world_camera, source)
+        else:
+            write_tum_poses(file, sequence.T_world_camera, sequence.timestamps_s)

@@ -1,0 +1,199 @@
+"""Photos aligned to a surface: slopes against finite differences, and what known errors come back as."""
+
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tube_sequence
+from command_line import invoke
+
+import endotwin
+from endotwin.align.corrections import SHARED, Corrections
+from endotwin.align.motion import adjoint, moved, twists_between
+from endotwin.align.photos import read_photos
+from endotwin.align.scene import SHADING_MEAN, Scene
+from endotwin.align.texture import sighted
+from endotwin.align.trajectory import compare
+from endotwin.align.written import write_poses
+from endotwin.errors import SequenceError, TrajectoryError
+from endotwin.sequence.poses import read_c3vd_poses, read_poses, write_c3vd_poses
+from endotwin.twin import Registration, Twin
+
+
+def some_twists(count: int, deg: float = 1.0, mm: float = 1.0, seed: int = 0) -> np.ndarray:
+    generator = np.random.default_rng(seed)
+    return np.c_[generator.normal(0, np.radians(deg), (count, 3)), generator.normal(0, mm, (count, 3))]
+
+
+@pytest.fixture(scope="module")
+def tube(tmp_path_factory) -> Twin:
+    folder = tmp_path_factory.mktemp("tube") / "sequence"
+    tube_sequence.write(folder, 6, 160, 120)
+    return endotwin.fuse_twin(folder)
+
+
+def test_a_motion_is_the_twist_that_it_was_made_of():
+    T, twists = tube_sequence.poses(5), some_twists(5)
+    np.testing.assert_allclose(twists_between(T, moved(T, twists)), twists, atol=1e-12)
+
+
+def test_the_adjoint_carries_a_twist_from_one_side_of_a_pose_to_the_other():
+    T, twists = tube_sequence.poses(5), some_twists(5)
+    carried = moved(np.eye(4)[None].repeat(5, 0), np.einsum("nij,nj->ni", adjoint(T), twists))
+    np.testing.assert_allclose(carried @ T, moved(T, twists), atol=1e-9)
+
+
+def test_slopes_of_corrections_are_those_of_finite_differences():
+    start = Corrections.none(tube_sequence.poses(6))
+    start = replace(
+        start, shared=np.r_[some_twists(2, 0.01, 0.01).ravel(), 0.2], own=some_twists(6, 0.01, 0.01, 1)
+    )
+    slopes = start.slopes()
+    for k in range(SHARED):
+        bent = replace(start, shared=start.shared + 1e-4 * np.eye(SHARED)[k])
+        found = twists_between(start.poses, bent.poses) / 1e-4
+        np.testing.assert_allclose(slopes[:, :, k], found, atol=0.01 * np.abs(found).max() + 1e-3)
+
+
+def test_a_lag_of_a_whole_frame_is_the_next_pose():
+    T = tube_sequence.poses(6)
+    later = replace(Corrections.none(T), shared=np.r_[np.zeros(12), 1.0]).poses
+    np.testing.assert_allclose(later[:-1], T[1:], atol=1e-9)
+
+
+def test_slopes_of_sighted_vertices_are_those_of_finite_differences(tube):
+    sequence, frame = tube.sequence(), 2
+    scene = Scene.of(tube.surface, sequence.camera, 4000)
+    photo, pose = read_photos(sequence, [frame])[frame], sequence.T_world_camera[frame]
+    light = SHADING_MEAN
+    for k, size in enumerate((3e-4, 3e-4, 3e-4, 0.01, 0.01, 0.01)):
+        ends = [sighted(scene, photo, moved(pose, sign * size * np.eye(6)[k]), 2.0) for sign in (-1, 0, 1)]
+        common = set.intersection(*(set(end.vertex.tolist()) for end in ends))
+        rows = [np.flatnonzero(np.isin(end.vertex, list(common))) for end in ends]
+        low, high = (
+            (end.shown - end.columns @ light)[row] for end, row in zip(ends[::2], rows[::2], strict=True)
+        )
+        found, told = (high - low) / (2 * size), ends[1].slopes(light)[rows[1], k]
+        assert len(common) > 200
+        assert np.corrcoef(found, told)[0, 1] > 0.98
+        assert np.polyfit(told, found, 1)[0] == pytest.approx(1, abs=0.05)
+
+
+def test_ate_and_rpe_are_those_of_evo():
+    metrics = pytest.importorskip("evo.core.metrics")
+    trajectory = pytest.importorskip("evo.core.trajectory")
+    true = tube_sequence.poses(12)
+    T = moved(true, some_twists(12, 0.5, 0.2))
+    found = compare(T, true)
+    pair = [trajectory.PosePath3D(poses_se3=list(poses)) for poses in (true, T)]
+    relation = metrics.PoseRelation
+
+    def evo(metric, paths) -> float:
+        metric.process_data(tuple(paths))
+        return metric.get_statistic(metrics.StatisticsType.rmse)
+
+    frames = metrics.Unit.frames
+    assert found.ate_mm == pytest.approx(evo(metrics.APE(relation.translation_part), pair))
+    assert found.ate_deg == pytest.approx(evo(metrics.APE(relation.rotation_angle_deg), pair))
+    assert found.rpe_mm == pytest.approx(evo(metrics.RPE(relation.translation_part, 1, frames), pair))
+    assert found.rpe_deg == pytest.approx(evo(metrics.RPE(relation.rotation_angle_deg, 1, frames), pair))
+    pair[1].align(pair[0])
+    assert found.aligned_mm == pytest.approx(evo(metrics.APE(relation.translation_part), pair))
+
+
+def test_trajectories_of_other_lengths_are_not_compared():
+    with pytest.raises(TrajectoryError, match="one a frame"):
+        compare(tube_sequence.poses(3), tube_sequence.poses(4))
+
+
+def test_a_twin_keeps_where_its_photos_were_aligned_to(tube, tmp_path):
+    twists = some_twists(6, 0.1, 0.1)
+    aligned = replace(tube, registration=Registration(tuple(map(tuple, twists.tolist())), {"model_mm": 0.1}))
+    aligned.save(tmp_path / "twin")
+    back = Twin.load(tmp_path / "twin")
+    written = tube.sequence().T_world_camera
+    assert back.registration == aligned.registration
+    np.testing.assert_array_equal(back.sequence().T_world_camera, aligned.sequence().T_world_camera)
+    np.testing.assert_allclose(twists_between(written, back.sequence().T_world_camera), twists, atol=1e-12)
+
+
+def test_a_sequence_that_grew_since_is_told(tube):
+    short = replace(tube, registration=Registration(((0.0,) * 6,) * 5))
+    with pytest.raises(SequenceError, match="5 were aligned"):
+        short.sequence()
+
+
+@pytest.mark.parametrize("format", ["c3vd", "tum"])
+def test_corrected_poses_are_read_back(tube, tmp_path, format):
+    sequence = replace(tube.sequence(), format=format)
+    write_poses(tmp_path / "poses.txt", sequence)
+    np.testing.assert_allclose(read_poses(tmp_path / "poses.txt")[0], sequence.T_world_camera, atol=1e-9)
+
+
+def hand_eye_error(example: Path, folder: Path, twist: np.ndarray) -> np.ndarray:
+    """The example's photos beside depth of its surface at other poses, which a wrong hand-eye matrix
+    gives."""
+    import cv2
+    import tifffile
+
+    from endotwin.surface.casting import Caster
+
+    twin = endotwin.fuse_twin(example)
+    sequence, caster = twin.sequence(), Caster(twin.surface)
+    true = sequence.T_world_camera
+    written = moved(true, -twist)
+    folder.mkdir()
+    rays = sequence.camera.pixel_directions
+    for index in range(len(sequence)):
+        hits = caster.cast(sequence.camera, written[index])
+        depth_mm = np.zeros(rays.shape[:2], np.float32).reshape(-1)
+        depth_mm[hits.pixel] = hits.distance_mm * rays.reshape(-1, 3)[hits.pixel, 2]
+        raw = np.uint16(np.clip(depth_mm / 100 * 65535, 0, 65535) + 0.5).reshape(rays.shape[:2])
+        tifffile.imwrite(folder / f"{index:04d}_depth.tiff", raw)
+        cv2.imwrite(str(folder / f"{index:04d}_color.png"), sequence.color(index)[..., ::-1])
+    (folder / "camera.json").write_bytes((example / "camera.json").read_bytes())
+    write_c3vd_poses(folder / "pose.txt", written)
+    return true
+
+
+@pytest.mark.slow
+def test_a_hand_eye_error_is_found_and_held_out_photos_gain(example, tmp_path, capsys):
+    twist = np.r_[np.radians([0.1, -0.1, 0.07]), 0.2, -0.2, 0.15]
+    true = hand_eye_error(example, tmp_path / "spoilt", twist)
+    write_c3vd_poses(tmp_path / "true.txt", true)
+    assert invoke("fuse", tmp_path / "spoilt", "-o", tmp_path / "twin") == 0
+    plain = endotwin.evaluate(endotwin.fit_twin(tmp_path / "twin", align="off"))
+    assert (
+        invoke(
+            "align", tmp_path / "twin", "--poses", tmp_path / "new.txt", "--against", tmp_path / "true.txt"
+        )
+        == 0
+    )
+    assert "as aligned: ATE" in capsys.readouterr().out
+    found = compare(read_c3vd_poses(tmp_path / "new.txt"), true)
+    before = compare(moved(true, -twist), true)
+    assert found.ate_mm < before.ate_mm / 2
+    aligned = endotwin.evaluate(endotwin.fit_twin(tmp_path / "twin"))
+    assert aligned.psnr_covered > plain.psnr_covered + 2
+
+
+@pytest.mark.slow
+def test_photos_that_lie_on_the_surface_stay(example):
+    aligned = endotwin.align_twin(endotwin.fuse_twin(example))
+    assert aligned.registration is None
+
+
+@pytest.mark.slow
+def test_depth_maps_that_moved_with_their_photos_find_back_to_each_other(example, tmp_path):
+    sequence = endotwin.open_sequence(example)
+    true = sequence.T_world_camera
+    wrong = moved(true, some_twists(len(true), 0.07, 0.15))
+    shutil.copytree(example, tmp_path / "spoilt")
+    write_c3vd_poses(tmp_path / "spoilt" / "pose.txt", wrong)
+    aligned = endotwin.align_twin(endotwin.fuse_twin(tmp_path / "spoilt"))
+    assert aligned.registration.with_depth
+    found = compare(aligned.sequence().T_world_camera, true)
+    assert found.rpe_mm < compare(wrong, true).rpe_mm / 3
+    assert found.aligned_mm < compare(wrong, true).aligned_mm / 3
