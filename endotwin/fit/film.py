@@ -385,10 +385,15 @@ class _Lobes:
         return first, torch.linalg.cross(self.axis, first)
 
     @property
+    def _bent(self) -> Tensor:
+        """Normals [M, 3], longer than 1 where they have a slope."""
+        first, second = self._tangents
+        return self.axis + self.values[:, :1] * first + self.values[:, 1:2] * second
+
+    @property
     def normal(self) -> Tensor:
         """Unit normals [M, 3]."""
-        first, second = self._tangents
-        return normalize(self.axis + self.values[:, :1] * first + self.values[:, 1:2] * second, dim=1)
+        return normalize(self._bent, dim=1)
 
     def radiance(self, glints: _Glints) -> Tensor:
         """What each pair of vertex and photo mirrors, [P]."""
@@ -396,31 +401,24 @@ class _Lobes:
 
     def linearised(self, glints: _Glints) -> tuple[Tensor, Tensor]:
         """What each pair of vertex and photo mirrors, [P], and its slopes by the vertex' values, [P, 3]."""
-        first, second = self._tangents
-        normal = self.normal
-        of_vertex = glints.of_vertex
-        half = glints.half
-        along = (normal.index_select(0, of_vertex)[:, None] * half).sum(dim=2)
-        sin2 = (1 - along * along).clamp_min(0)
-        weight = self.values[:, 2].exp().index_select(0, of_vertex)[:, None]
-        each = weight * mirrored(glints.strength, sin2, self.roughness)
-        alpha2 = self.roughness**4
-        by_sin2 = -2 * (1 - alpha2) * each / (sin2 + alpha2 * (1 - sin2))
+
+        def at_pairs(per_vertex: Tensor) -> Tensor:
+            return per_vertex.index_select(0, glints.of_vertex)[:, None]
+
+        normal, length, alpha2 = self.normal, self._bent.norm(dim=1, keepdim=True), self.roughness**4
+        apart2 = ((at_pairs(normal) - glints.half) ** 2).sum(dim=2)
+        cos, sin2 = 1 - apart2 / 2, apart2 * (1 - apart2 / 4)  # exact near the mirror direction
+        each = at_pairs(self.values[:, 2].exp()) * mirrored(glints.strength, sin2, self.roughness)
+        by_cos = 4 * cos * (1 - alpha2) * each / (sin2 + alpha2 * (1 - sin2))
         slopes = []
-        for tangent in (first, second):
-            across = tangent - (tangent * normal).sum(dim=1, keepdim=True) * normal
-            across = across / (self.axis + self.values[:, :1] * first + self.values[:, 1:2] * second).norm(
-                dim=1, keepdim=True
-            )
-            turned = (across.index_select(0, of_vertex)[:, None] * half).sum(dim=2)
-            slopes.append((by_sin2 * -2 * along * turned).sum(dim=1))
+        for tangent in self._tangents:
+            across = (tangent - (tangent * normal).sum(dim=1, keepdim=True) * normal) / length
+            slopes.append((by_cos * (at_pairs(across) * glints.half).sum(dim=2)).sum(dim=1))
         film = each.sum(dim=1)
         return film, torch.stack([*slopes, film], dim=1)
 
     def film(self, glints: _Glints) -> Film:
         """The film of those that can shine."""
         wet = (self.values[:, 2] - glints.log_weight_of_peak(self.roughness)).exp() * PEAK > FAINT
-        weight = self.values[:, 2].exp()
-        return Film(
-            *(each[wet].numpy() for each in (torch.from_numpy(glints.vertex).int(), self.normal, weight))
-        )
+        normal, weight = self.normal[wet].numpy(), self.values[wet, 2].exp().numpy()
+        return Film(glints.vertex[wet.numpy()].astype(np.int32), normal, weight)

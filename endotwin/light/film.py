@@ -54,7 +54,7 @@ def mirrored(strength: Tensor, sin2: Tensor, roughness: float) -> Tensor:
     Args:
         strength: 2π·L of the guide. sin2: |n × wm|², wm the half vector.
     """
-    return strength * (shading.F0_WATER / 4) * shading.ggx(sin2, torch.tensor(roughness**2))
+    return strength * (shading.F0_WATER / 4) * shading.ggx(sin2, torch.tensor(roughness**2, dtype=sin2.dtype))
 
 
 def mirrors(

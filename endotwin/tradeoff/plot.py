@@ -35,7 +35,17 @@ STYLE = {
     "ytick.labelcolor": "#333333",
     "svg.hashsalt": "endotwin",
 }
-KNOB_COLORS = ("#d1495b", "#2e86ab", "#e39c2c", "#3d9970", "#8e6bbf", "#a1674a", "#5f9ea0", "#c2679b")
+KNOB_COLORS = (
+    "#d1495b",
+    "#2e86ab",
+    "#e39c2c",
+    "#3d9970",
+    "#8e6bbf",
+    "#a1674a",
+    "#5f9ea0",
+    "#c2679b",
+    "#7a8b2f",
+)
 PRESET_COLOR, FRONT_COLOR, KNEE_COLOR = "#222222", "#bbbbbb", "#d1495b"
 STAGE_COLORS = {
     "start-up and files": "#d5d5d5",
