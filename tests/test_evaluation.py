@@ -11,12 +11,13 @@ import tube_sequence
 from endotwin.effects.gain import Gain
 from endotwin.errors import OptionError, OutputError, SequenceError, TwinError
 from endotwin.evaluation import evaluate
+from endotwin.evaluation.evaluation import MEANS
 from endotwin.pipeline import fuse_twin
 from endotwin.render import Renderer
 from endotwin.sequence.readers import open_sequence
 from endotwin.twin import Light, Materials, Response, Twin
 
-JSON_KEYS = ["psnr", "ssim", "lpips", "psnr_covered", "covered", "gamma", "light", "frames"]
+JSON_KEYS = [*MEANS, "gamma", "light", "frames"]
 
 
 @pytest.fixture(scope="module")

@@ -27,6 +27,7 @@ import numpy as np
 
 from endotwin.errors import OptionError, TwinError
 from endotwin.evaluation import metrics
+from endotwin.evaluation.highlights import Alike
 from endotwin.evaluation.kept import keep_scores
 from endotwin.evaluation.renders import read_render, rendered_files
 from endotwin.light import shading
@@ -51,6 +52,9 @@ MID_TONES = (0.1, 0.9)
 
 POOR_DB = 20.0
 """A twin with a lower PSNR does not look like its photos."""
+
+MEANS = ("psnr", "ssim", "lpips", "psnr_covered", "covered", "psnr_dull", "precision", "recall", "sizes")
+"""Scores of which a twin keeps the mean."""
 
 ERROR_FULL_SCALE = 0.25
 """Absolute display-value error that the contact sheet draws in its brightest colour."""
@@ -78,6 +82,10 @@ class FrameScore:
     ssim_covered: float
     lpips_covered: float
     covered: float
+    psnr_dull: float
+    precision: float
+    recall: float
+    sizes: float
 
 
 @dataclass(frozen=True)
@@ -142,9 +150,8 @@ class Evaluation:
         def plain(value):
             return None if isinstance(value, float) and not math.isfinite(value) else value
 
-        means = ("psnr", "ssim", "lpips", "psnr_covered", "covered")
         return {
-            **{name: plain(self.mean(name)) for name in means},
+            **{name: plain(self.mean(name)) for name in MEANS},
             "gamma": self.gamma,
             "light": self.light and asdict(self.light),
             "frames": [
@@ -271,6 +278,7 @@ def _score(held_out: _HeldOut) -> FrameScore:
     distance = np.full(valid.shape, np.nan)
     if metrics.lpips_installed():
         distance = metrics.lpips_map(photo, render, valid)
+    glints = Alike.of(photo, render, valid)
     return FrameScore(
         index=held_out.frame.index,
         name=held_out.frame.name,
@@ -282,6 +290,10 @@ def _score(held_out: _HeldOut) -> FrameScore:
         ssim_covered=metrics.masked_mean(similarity, covered),
         lpips_covered=metrics.masked_mean(distance, covered),
         covered=math.nan if held_out.covered is None else float(covered.sum() / valid.sum()),
+        psnr_dull=metrics.psnr(photo, render, glints.dull),
+        precision=glints.precision,
+        recall=glints.recall,
+        sizes=glints.sizes,
     )
 
 
@@ -377,9 +389,10 @@ def _to_be_scored(
 
 def _sheet_row(held_out: _HeldOut, score: FrameScore) -> np.ndarray:
     """Photo, render and error side by side, uint8 [h, 3·SHEET_WIDTH, 3], RGB."""
+    found = f", highlights {score.recall:.0%}" if math.isfinite(score.recall) else ""
     pictures = {
         f"photo {held_out.frame.name}": held_out.frame.color,
-        f"render, {score.psnr:.1f} dB": _eight_bit(held_out.render),
+        f"render, {score.psnr:.1f} dB{found}": _eight_bit(held_out.render),
         f"error, 0 to {ERROR_FULL_SCALE:g}": error_heat(held_out.photo, held_out.render, held_out.valid),
     }
     return np.hstack([_labelled(picture, label) for label, picture in pictures.items()])
