@@ -11,7 +11,12 @@ import trimesh
 import tube_twin
 
 from endotwin.cameras import Camera
+from endotwin.effects import Effects
+from endotwin.effects.coat import Coat
+from endotwin.effects.film import Film as FilmEffect
+from endotwin.effects.specular import Specular
 from endotwin.errors import OptionError
+from endotwin.light.film import Film
 from endotwin.render import Renderer
 from endotwin.render.renderer import Rays
 from endotwin.surface import Surface
@@ -185,6 +190,20 @@ def test_diffuse_and_specular_add_up_to_the_radiance(folded):
     np.testing.assert_array_equal(images["diffuse"], without["rgb"])
     shine = images["rgb"] - images["diffuse"]
     assert shine.min() >= -1e-6 and shine.max() > 0.02
+
+
+def test_highlights_are_where_coat_and_film_shine_and_diffuse_has_neither(folded):
+    twin, poses = folded
+    vertex = np.arange(0, len(twin.surface.vertices_mm), 7, dtype=np.int32)
+    film = Film(vertex, twin.surface.normals[vertex], np.ones(len(vertex), np.float32))
+    effects = Effects([Specular(), Coat(0.8, 0.15), FilmEffect(roughness=0.1)])
+    wet = replace(twin, materials=replace(twin.materials, film=film), effects=effects)
+    images, dry = (labelled(t, poses, t.camera).frame(1) for t in (wet, twin))
+    np.testing.assert_array_equal(images["diffuse"], dry["diffuse"])
+    np.testing.assert_allclose(images["diffuse"] + images["specular"], images["rgb"], atol=1e-6)
+    shines = (images["rgb"] - images["diffuse"]).min(axis=2) > 0.1
+    assert shines.any() and not shines.all()
+    np.testing.assert_array_equal(images["highlights"] == 255, shines)
 
 
 def test_linear_rgb_is_what_the_response_makes_the_colours_of(folded):

@@ -197,7 +197,17 @@ ENCODINGS: dict[str, Encoding] = {
     "diffuse": Encoding(
         ".png",
         lambda color: png(encode_color(color)),
-        "8-bit RGB as rgb, without specular reflection",
+        "8-bit RGB as rgb, without specular reflection, and before the sensor",
+    ),
+    "specular": Encoding(
+        ".png",
+        lambda color: png(encode_color(color)),
+        "8-bit RGB: what specular reflection adds to diffuse, in display values",
+    ),
+    "highlights": Encoding(
+        ".png",
+        png,
+        "8-bit: 255: specular reflection adds more than 0.1 to each display value; 0: it does not",
     ),
     "flow": Encoding(
         ".tiff",

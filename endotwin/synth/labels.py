@@ -34,6 +34,7 @@ LABELS: dict[str, tuple[str, ...]] = {
     "roughness": ("roughness",),
     "metallic": ("metallic",),
     "diffuse": ("diffuse",),
+    "specular": ("specular", "highlights"),
     "flow": ("flow", "flow_hidden"),
     "flow_forward": ("flow_forward", "flow_forward_hidden"),
     "flow_exr": ("flow_exr", "flow_hidden"),
@@ -47,9 +48,16 @@ LABELS: dict[str, tuple[str, ...]] = {
 
 DEFAULT_LABELS = ("rgb", "depth", "normals", "mask")
 
+MIRRORS = ("coat", "film")
+"""Effects that reflect without scattering."""
+
+HIGHLIGHT = 0.1
+"""Display values by which specular reflection brightens a pixel of a highlight, in its darkest channel."""
+
 PHOTOS = {"rgb", "rgb_linear", "rgb_exr"}
-SHADED = PHOTOS | {"diffuse", "albedo", "roughness", "metallic"}
-"""Labels that need a photo, and those that need the frame's draw at all."""
+SPLIT = {"diffuse", "specular"}
+SHADED = PHOTOS | SPLIT | {"albedo", "roughness", "metallic"}
+"""Labels that need a photo, those of its parts, and all that need the frame's draw."""
 
 
 def parse_labels(text: str) -> tuple[str, ...]:
@@ -100,8 +108,10 @@ class Labeller:
             )
             images = {"rgb": color, "rgb_linear": radiance, "rgb_exr": radiance}
         if specular_free is not None:
-            matt = specular_free.view(T_world_camera)
-            images["diffuse"], view = matt.color, view or matt
+            view = view or renderer.view(T_world_camera)
+            images["diffuse"] = specular_free.view(T_world_camera).color
+            images["specular"] = view.color - images["diffuse"]
+            images["highlights"] = np.uint8(255 * (images["specular"].min(axis=2) > HIGHLIGHT))
         hits = view.hits if view else self._caster.cast(job.camera, T_world_camera)
         geometry = _Geometry(job, self._caster, hits, index, self._kinds, renderer, view)
         for name in job.images:
@@ -120,9 +130,10 @@ class Labeller:
             else:
                 renderer = kept[1].edited(twin, exposure)
             specular_free = None
-            if "diffuse" in self._job.labels:
+            if SPLIT & set(self._job.labels):
                 matt = replace(twin.materials, f0=0.0)
-                specular_free = renderer.edited(replace(twin, materials=matt), exposure)
+                matt = replace(twin, materials=matt, effects=twin.effects.without(MIRRORS))
+                specular_free = renderer.edited(matt, exposure)
             kept = self._shaded = (draw, renderer, specular_free)
         return kept[1:]
 
