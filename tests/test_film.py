@@ -187,3 +187,22 @@ def test_a_film_lies_on_disk_with_its_twin_and_damage_to_it_is_said(tmp_path):
     replace(twin, materials=replace(twin.materials, film=beyond)).save(tmp_path / "bad")
     with pytest.raises(TwinError, match="the film makes no sense"):
         Twin.load(tmp_path / "bad")
+
+
+@pytest.mark.parametrize("strength", [0.0, 1e-30, 1e30])
+def test_vertices_in_shadow_dim_or_dazzling_light_leave_no_nan(strength):
+    glints = made_up(strength, shown=torch.tensor([0.0, 0.5, 1.0])[:, None].expand(3, 3))
+    film = glints.fitted(0.05).film(glints)
+    assert np.isfinite(film.normal).all() and np.isfinite(film.weight).all()
+    assert strength or not len(film)
+
+
+def made_up(strength: float, shown: torch.Tensor) -> _Glints:
+    """One vertex in three photos, of ``shown`` [3, 3], a tenth of a degree from each other."""
+    half = unit(np.array([[[0, 0.002 * k, 1.0]] for k in range(3)], np.float32))
+    normal = torch.tensor([[0.0, 0.0, 1.0]])
+    radiance, of_vertex = torch.full((3, 3), 0.05), torch.zeros(3, dtype=torch.long)
+    light = torch.full((3, 1), strength)
+    return _Glints(
+        np.arange(1), torch.arange(3), of_vertex, torch.from_numpy(half), light, shown, radiance, normal, 0.45
+    )

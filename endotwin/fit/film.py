@@ -45,8 +45,9 @@ APART = 4
 """Every so many photos one is kept apart, to judge by: between its neighbours, as a held-out photo is."""
 
 ROUGHNESSES = (0.05, 0.06, 0.075, 0.095, 0.12)
-STEPS, DAMPING, LEAST_DAMPING = 15, 1e-2, 1e-6
-"""Of Levenberg–Marquardt; the last keeps vertices regular that no photo tells of."""
+STEPS, DAMPING, MOST_DAMPING = 15, 1e-2, 1e6
+LEAST_DAMPING, LEAST_TOLD = 1e-6, 1e-12
+"""Of Levenberg–Marquardt; the last two keep those vertices regular that no photo tells of."""
 
 LONGEST_SLOPES, LONGEST_LOG = 2.0, 1.5
 """The longest step: of a normal, in widths of the lobe, and of a weight's logarithm."""
@@ -264,7 +265,8 @@ class _Glints:
 
     def _total(self, values: Tensor) -> Tensor:
         """Sums [M, ...] over the pairs of each vertex of ``values`` [P, ...]."""
-        return torch.zeros(len(self.vertex), *values.shape[1:]).index_add_(0, self.of_vertex, values)
+        total = torch.zeros(len(self.vertex), *values.shape[1:], dtype=values.dtype)
+        return total.index_add_(0, self.of_vertex, values)
 
     def fitted(self, roughness: float) -> _Lobes:
         """The lobes that show the pairs best: Levenberg–Marquardt, each vertex for itself."""
@@ -272,22 +274,24 @@ class _Glints:
         middle, damping = lobes.values[:, 2], torch.full((len(self.vertex),), DAMPING)
 
         def cost(lobes: _Lobes, film: Tensor) -> Tensor:
-            return self._total(self._cost(film)) + precision / 2 * (lobes.values[:, 2] - middle) ** 2
+            return self._total(self._cost(film)) + precision / 2 * off(lobes) ** 2
+
+        def off(lobes: _Lobes) -> Tensor:
+            return torch.nan_to_num(lobes.values[:, 2] - middle)
 
         film, slopes = lobes.linearised(self)
         before = cost(lobes, film)
         for _ in range(STEPS):
             normal, pull = self._normal_equations(film, slopes)
             normal[:, 2, 2] += precision
-            pull[:, 2] += precision * (middle - lobes.values[:, 2])
-            diagonal = normal.diagonal(dim1=1, dim2=2)
-            normal = normal + torch.diag_embed(damping[:, None] * diagonal + LEAST_DAMPING)
-            moved = lobes.moved(torch.linalg.solve(normal, pull))
+            pull[:, 2] -= precision * off(lobes)
+            moved = lobes.moved(_damped(normal, pull, damping))
             tried = moved.linearised(self)
             after = cost(moved, tried[0])
             better = after < before
             lobes = replace(lobes, values=torch.where(better[:, None], moved.values, lobes.values))
-            before, damping = torch.where(better, after, before), damping * torch.where(better, 0.3, 5.0)
+            before = torch.where(better, after, before)
+            damping = (damping * torch.where(better, 0.3, 5.0)).clamp(max=MOST_DAMPING)
             chosen = better.index_select(0, self.of_vertex)
             film = torch.where(chosen, tried[0], film)
             slopes = torch.where(chosen[:, None], tried[1], slopes)
@@ -301,15 +305,15 @@ class _Glints:
         by_film = self.gamma * (shown + shading.RADIANCE_MIN**self.gamma) / (x + shading.RADIANCE_MIN)
         by_film = by_film * ((shown < 1) | (self.shown < 1))
         pull = (by_film * (self.shown - shown.clamp(max=1))).sum(dim=1, keepdim=True) * slopes
-        square = (by_film**2).sum(dim=1)[:, None, None] * slopes[:, :, None] * slopes[:, None]
-        return self._total(square), self._total(pull)
+        slopes = by_film.double().norm(dim=1, keepdim=True) * slopes
+        return self._total(slopes[:, :, None] * slopes[:, None]), self._total(pull.double())
 
     def log_weight_of_peak(self, roughness: float) -> Tensor:
-        """ln of the weight that gives each vertex a peak radiance of PEAK, [M]."""
+        """ln of the weight that gives each vertex a peak radiance of PEAK, [M]; −∞ where no guide shines."""
         strength = torch.zeros(len(self.vertex))
         strength.scatter_reduce_(0, self.of_vertex, self.strength.amax(dim=1), "amax")
         peak = mirrored(strength, torch.zeros_like(strength), roughness)
-        return math.log(PEAK) - torch.log(peak.clamp_min(1e-9))
+        return torch.where(strength > 0, math.log(PEAK) - torch.log(peak), -torch.inf)
 
     def _start(self, roughness: float) -> _Lobes:
         """Lobes about the mean half vector of each vertex' glints, each with the guide whose half vector is
@@ -321,6 +325,14 @@ class _Glints:
         axis = normalize(self._total(excess**2 * half) + 1e-9 * self.normal, dim=1)
         values = torch.cat([torch.zeros(len(axis), 2), self.log_weight_of_peak(roughness)[:, None]], dim=1)
         return _Lobes(axis, values, roughness)
+
+
+def _damped(normal: Tensor, pull: Tensor, damping: Tensor) -> Tensor:
+    """Steps [M, 3] that solve (N + damping·diag N)·step = pull for N [M, 3, 3]; 0 along what nothing tells."""
+    scale = normal.diagonal(dim1=1, dim2=2).clamp_min(LEAST_TOLD).rsqrt()
+    scaled = normal * scale[:, :, None] * scale[:, None]
+    scaled = scaled + torch.diag_embed((damping[:, None] + LEAST_DAMPING).expand_as(scale))
+    return (scale * torch.linalg.solve(scaled, scale * pull)).float()
 
 
 def _pairs(based: Based, vertex: np.ndarray) -> tuple[csr_array, np.ndarray, np.ndarray]:
@@ -419,6 +431,7 @@ class _Lobes:
 
     def film(self, glints: _Glints) -> Film:
         """The film of those that can shine."""
-        wet = (self.values[:, 2] - glints.log_weight_of_peak(self.roughness)).exp() * PEAK > FAINT
+        peak = PEAK * (self.values[:, 2] - glints.log_weight_of_peak(self.roughness)).exp()
+        wet = peak > FAINT  # false where no guide shines: −∞ less −∞
         normal, weight = self.normal[wet].numpy(), self.values[wet, 2].exp().numpy()
         return Film(glints.vertex[wet.numpy()].astype(np.int32), normal, weight)

@@ -157,7 +157,9 @@ def fit_twin(
         twin = replace(twin, surface=replace(surface, normals=normals))
     with stopwatch.stage("film"):
         wanted = states.get("film", "auto") if "specular" in decided.effects else "off"
-        film, wet, judged = Model(twin, state, relighting, caster).film(samples, wanted, pace.report)
+        film, wet, judged = None, None, Decision("off", "no time to judge")
+        if not pace.out_of_time():
+            film, wet, judged = Model(twin, state, relighting, caster).film(samples, wanted, pace.report)
     odd = unusual(state.shared)
     if odd:
         logger.warning(
