@@ -328,7 +328,7 @@ class _Glints:
 
 
 def _damped(normal: Tensor, pull: Tensor, damping: Tensor) -> Tensor:
-    """Steps [M, 3] that solve (N + damping·diag N)·step = pull for N [M, 3, 3]; 0 along what nothing tells."""
+    """Steps [M, 3] that solve (N + damping·diag N)·step = pull, N [M, 3, 3]; 0 where nothing tells."""
     scale = normal.diagonal(dim1=1, dim2=2).clamp_min(LEAST_TOLD).rsqrt()
     scaled = normal * scale[:, :, None] * scale[:, None]
     scaled = scaled + torch.diag_embed((damping[:, None] + LEAST_DAMPING).expand_as(scale))
