@@ -20,15 +20,16 @@ from scipy.sparse import csr_array
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from endotwin.cameras import Camera
 from endotwin.effects import Decision
 from endotwin.effects.film import Film as FilmEffect
 from endotwin.fit.gauss_newton import State
-from endotwin.fit.lighting import Relighting, lit
+from endotwin.fit.lighting import Relighting, exposed, lit
 from endotwin.fit.model import at_pixels, radiance
 from endotwin.light import shading
 from endotwin.light.film import Film, mirrored, mirrors
 from endotwin.light.guides import AT_LENS, visible_from
-from endotwin.pixels.samples import Samples, Views, drawn, frame_samples
+from endotwin.pixels.samples import Samples, Views, frame_samples
 from endotwin.run.ahead import ahead
 from endotwin.run.threads import THREADS
 from endotwin.surface.casting import Caster
@@ -91,8 +92,10 @@ class Model:
         def decided(state: str, reason: str, gain_db: float) -> Decision:
             return Decision(state, reason, round(gain_db, 3), round(time.perf_counter() - began, 3))
 
-        rows = drawn(len(samples), JUDGES, np.random.default_rng(0))
-        judges = self.based(samples[torch.from_numpy(rows)])
+        samples = samples.thinned(JUDGES, np.random.default_rng(0))
+        if samples.log_exposure is not None:
+            samples = exposed(samples, self.relighting.effects)  # whose gain has changed since
+        judges = self.based(samples)
         most_db = judges.most_db()
         if not judges.shines.any() or (wanted == "auto" and most_db < LEAST_DB):
             return None, None, decided("off", f"glints beyond the model cost {most_db:.2f} dB", most_db)
@@ -113,9 +116,8 @@ class Model:
         return film, FilmEffect(roughness=roughness), decided("on", reason, gain_db)
 
     def based(self, samples: Samples) -> Based:
-        """``samples`` with what the model shows there."""
+        """``samples``, which are lit, with what the model shows there."""
         triangles = torch.from_numpy(self.twin.surface.triangles.astype(np.int64))
-        samples = lit(samples, self.twin.surface, self.caster, self.relighting.effects)
         samples = self.relighting.bounced(samples, triangles, self.state)
         material = at_pixels(samples, triangles, self.state.materials)
         return Based(self, samples, radiance(samples, material, self.state.shared))
@@ -140,10 +142,10 @@ class Model:
             report("find the film", done, len(views.frames))
         names = [name for name, value in vars(parts[0]).items() if value is not None]
         joined = {name: torch.cat([getattr(part, name) for part in parts]) for name in names}
-        return Samples(**joined, views=views)
+        return lit(Samples(**joined, views=views), twin.surface, self.caster, self.relighting.effects)
 
 
-def _splatted(camera, points_mm: np.ndarray) -> np.ndarray:
+def _splatted(camera: Camera, points_mm: np.ndarray) -> np.ndarray:
     """Bool [H, W]: pixels within REACH_PX of where ``points_mm`` [N, 3] (camera frame) are seen."""
     seen = np.zeros((camera.height, camera.width), np.uint8)
     uv = np.rint(camera.project(points_mm[points_mm[:, 2] > 0])).astype(np.int64)
@@ -253,10 +255,6 @@ class _Glints:
         """The ``chosen`` pairs, bool [P]."""
         names = ("row", "of_vertex", "half", "strength", "shown", "radiance")
         return replace(self, **{name: getattr(self, name)[chosen] for name in names})
-
-    def squared(self, lobes: _Lobes) -> float:
-        """Sum of the squared errors with ``lobes``."""
-        return float(self._cost(lobes.radiance(self)).sum())
 
     def _cost(self, film: Tensor) -> Tensor:
         """Half the squared error of each pair, [P], with the radiance [P] of its film."""
