@@ -12,9 +12,9 @@ from endotwin.effects import parse_states
 from endotwin.errors import OptionError
 from endotwin.run.output import DATASET, check_apart, check_free, check_picture
 
-LABELS = "rgb, rgb_linear, rgb_exr, depth, depth_exr, normals, mask, albedo, roughness, metallic, diffuse, "
-LABELS += (
-    "flow, flow_forward, flow_exr, flow_npz, flow_forward_exr, flow_forward_npz, occlusion, triangles; 'all'"
+LABELS = (
+    "rgb, rgb_linear, rgb_exr, depth, depth_exr, normals, mask, albedo, roughness, metallic, diffuse, "
+    "specular, flow, flow_forward, flow_exr, flow_npz, flow_forward_exr, flow_forward_npz, occlusion, triangles; 'all'"
 )
 
 

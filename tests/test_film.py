@@ -30,6 +30,7 @@ from endotwin.pixels.samples import gather
 from endotwin.render import Renderer
 from endotwin.surface.casting import Caster
 from endotwin.surface.vectors import unit
+from endotwin.synth.job import fingerprint
 from endotwin.twin import Twin
 
 GUIDES = Offset(((3.2, 0.5, 0.0), (-2.8, 2.7, 0.0)))
@@ -179,10 +180,13 @@ def test_the_slopes_of_the_lobes_are_those_of_automatic_differentiation(seed):
 def test_a_film_lies_on_disk_with_its_twin_and_damage_to_it_is_said(tmp_path):
     twin = tube(Effects([Specular(), FilmEffect(roughness=ROUGHNESS)]))
     film = wet(twin)
-    replace(twin, materials=replace(twin.materials, film=film)).save(tmp_path / "twin")
+    wetted = replace(twin, materials=replace(twin.materials, film=film))
+    wetted.save(tmp_path / "twin")
     read = Twin.load(tmp_path / "twin").materials.film
     for name, values in vars(film).items():
         np.testing.assert_array_equal(getattr(read, name), values)
+    dry = replace(twin, materials=replace(twin.materials, film=None))
+    assert fingerprint(Twin.load(tmp_path / "twin")) == fingerprint(wetted) != fingerprint(dry)
     beyond = replace(film, vertex=film.vertex + len(twin.surface.vertices_mm))
     replace(twin, materials=replace(twin.materials, film=beyond)).save(tmp_path / "bad")
     with pytest.raises(TwinError, match="the film makes no sense"):

@@ -79,11 +79,13 @@ class Job:
 def fingerprint(twin: Twin) -> str:
     """SHA-256 of all that a rendering depends on: surface, materials, camera, light, response, effects."""
     digest = hashlib.sha256(json.dumps(twin.effects.to_dict(), sort_keys=True).encode())
-    for part in (twin.surface, twin.camera, twin.materials, twin.light, twin.response):
-        for field in fields(part):
-            value = np.ascontiguousarray(getattr(part, field.name))
-            digest.update(f"{field.name} {value.dtype.str} {value.shape}".encode())
-            digest.update(value.tobytes())
+    parts = (twin.surface, twin.camera, twin.light, twin.response)
+    values = [(field.name, getattr(part, field.name)) for part in parts for field in fields(part)]
+    materials = twin.materials.arrays | twin.materials.constants
+    for name, value in (*values, *materials.items()):
+        array = np.ascontiguousarray(value)
+        digest.update(f"{name} {array.dtype.str} {array.shape}".encode())
+        digest.update(array.tobytes())
     return digest.hexdigest()
 
 
