@@ -19,6 +19,7 @@ from endotwin.align.trajectory import compare
 from endotwin.align.written import write_poses
 from endotwin.errors import SequenceError, TrajectoryError
 from endotwin.sequence.poses import read_c3vd_poses, read_poses, write_c3vd_poses
+from endotwin.surface.casting import Caster
 from endotwin.twin import Registration, Twin
 
 
@@ -65,7 +66,7 @@ def test_a_lag_of_a_whole_frame_is_the_next_pose():
 
 def test_slopes_of_sighted_vertices_are_those_of_finite_differences(tube):
     sequence, frame = tube.sequence(), 2
-    scene = Scene.of(tube.surface, sequence.camera, 4000)
+    scene = Scene.of(Caster(tube.surface), sequence.camera, 4000)
     photo, pose = read_photos(sequence, [frame])[frame], sequence.T_world_camera[frame]
     light = SHADING_MEAN
     for k, size in enumerate((3e-4, 3e-4, 3e-4, 0.01, 0.01, 0.01)):

@@ -16,6 +16,7 @@ from endotwin.align.scene import Scene
 from endotwin.align.solve import Looked, look, step
 from endotwin.errors import OptionError
 from endotwin.sequence import Sequence
+from endotwin.surface.casting import Caster
 from endotwin.twin import Registration, Twin
 
 STATES = ("auto", "on", "off")
@@ -80,14 +81,14 @@ class Aligner:
         frames: int [F], the photos that take part; ``choosers`` and ``judges`` among them.
     """
 
-    def __init__(self, twin: Twin, progress: Progress | None):
+    def __init__(self, twin: Twin, caster: Caster, progress: Progress | None):
         scale = min(1.0, WIDTH / twin.camera.width) * twin.source.scale
         self.sequence: Sequence = replace(twin.source, scale=scale).open()
         training = np.array(twin.source.training(len(self.sequence)))
         self.frames = training[np.unique(np.linspace(0, len(training) - 1, PHOTOS).round().astype(int))]
         judging = np.arange(len(self.frames)) % JUDGES == JUDGES // 2
         self.choosers, self.judges = self.frames[~judging], self.frames[judging]
-        self.surface, self.camera = twin.surface, self.sequence.camera
+        self.caster, self.camera = caster, self.sequence.camera
         self.photos: dict = {}
         self._progress = progress or _silent
         self._looks, self._expected = 0, len(BLURS) + len(OWN_BLURS) + 1
@@ -99,7 +100,7 @@ class Aligner:
         """By how much the photos' error would fall at a glance, if all were granted that some of them ask
         for."""
         some = self.frames[np.unique(np.linspace(0, len(self.frames) - 1, GLANCE_PHOTOS).round().astype(int))]
-        scene = Scene.of(self.surface, self.camera, GLANCE_VERTICES)
+        scene = Scene.of(self.caster, self.camera, GLANCE_VERTICES)
         now, blur_px = Corrections.none(self.sequence.T_world_camera), self.blur_px(BLURS[1])
         photos = self._read(some)
         before = look(scene, photos, now.poses, some, blur_px)
@@ -110,7 +111,7 @@ class Aligner:
         """The corrections (None: the photos stay), why, and what the judges say of them. If ``forced``, those
         that all photos share are kept whatever the judges say."""
         self._read(self.frames)
-        scene = Scene.of(self.surface, self.camera, VERTICES)
+        scene = Scene.of(self.caster, self.camera, VERTICES)
         none = Corrections.none(self.sequence.T_world_camera)
         was = self._errors(scene, none)
         shared = self._steps(scene, none, self.choosers, BLURS, own=False)
@@ -176,13 +177,14 @@ def align(twin: Twin, state: str = "auto", progress: Progress | None = None) -> 
     sequence = twin.source.open()
     if len(twin.source.training(len(sequence))) < LEAST_PHOTOS:
         return decided(None, "too few photos to choose and to judge", None)
-    depth_db = depths.gain_db(twin, sequence)
+    caster = Caster(twin.surface)
+    depth_db = depths.gain_db(twin, sequence, caster)
     if depth_db >= depths.MIN_GAIN_DB:
         surface, found = depths.registered(twin, sequence, progress or _silent)
         twin = replace(twin, surface=surface)
         reason = f"depth maps, which agree better by {depth_db:.1f} dB once each may move with its photo"
         return decided(_registration(found, with_depth=True), reason, None)
-    aligner = Aligner(twin, progress)
+    aligner = Aligner(twin, caster, progress)
     if state == "auto":
         asked_db = aligner.asked_db()
         if asked_db < MIN_GAIN_DB / 2:

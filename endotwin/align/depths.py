@@ -47,23 +47,21 @@ GLANCE_FRAMES = 12
 
 
 def disagreement(
-    surface: Surface, sequence: Sequence, poses: np.ndarray, frames: np.ndarray
+    caster: Caster, sequence: Sequence, poses: np.ndarray, frames: np.ndarray
 ) -> tuple[np.ndarray, float]:
-    """The twist [F, 6] that brings each depth map of ``frames`` [F] next to the surface, and the robust width
-    of their distances to it now, in mm.
+    """The twist [F, 6] that brings each depth map of ``frames`` [F] next to the surface of ``caster``, and
+    the robust width of their distances to it now, in mm.
 
     Args:
         poses: T_world_camera [N, 4, 4] by frame.
     """
-    caster = Caster(surface, threads=1)
-    found = list(ahead(lambda f: _one(surface, caster, sequence, poses[f], f), frames.tolist(), THREADS))
+    caster = caster.threaded(1)
+    found = list(ahead(lambda f: _one(caster, sequence, poses[f], f), frames.tolist(), THREADS))
     widths = [width for _, width in found if width > 0]
     return np.array([twist for twist, _ in found]), float(np.mean(widths)) if widths else 0.0
 
 
-def _one(
-    surface: Surface, caster: Caster, sequence: Sequence, pose: np.ndarray, frame: int
-) -> tuple[np.ndarray, float]:
+def _one(caster: Caster, sequence: Sequence, pose: np.ndarray, frame: int) -> tuple[np.ndarray, float]:
     depth_mm = sequence.depth_mm(frame)
     known = np.flatnonzero(np.isfinite(depth_mm))
     drawn = np.random.default_rng(frame).choice(known, min(PIXELS, len(known)), replace=False)
@@ -72,7 +70,7 @@ def _one(
     hits = caster.cast(sequence.camera, pose, chosen.reshape(depth_mm.shape))
     rays = sequence.camera.pixel_directions.reshape(-1, 3)[hits.pixel].astype(np.float64)
     measured = rays * (depth_mm.reshape(-1)[hits.pixel] / rays[:, 2])[:, None]
-    normals = unit(hits.interpolate(surface, surface.normals).astype(np.float64) @ pose[:3, :3])
+    normals = unit(hits.interpolate(caster.surface, caster.surface.normals).astype(np.float64) @ pose[:3, :3])
     apart = measured - rays * hits.distance_mm[:, None]
     near = np.abs(dot(apart, rays)) < FARTHEST * hits.distance_mm
     rows = np.flatnonzero(near & (-dot(normals, rays) > GRAZING))
@@ -87,14 +85,14 @@ def _one(
     return np.linalg.solve(normal, -slopes.T @ (weight * distance)), width
 
 
-def gain_db(twin: Twin, sequence: Sequence) -> float:
+def gain_db(twin: Twin, sequence: Sequence, caster: Caster) -> float:
     """By how much the disagreement of some depth maps falls if each moves by itself, dB."""
     training = np.array(twin.source.training(len(sequence)))
     some = training[np.unique(np.linspace(0, len(training) - 1, GLANCE_FRAMES).round().astype(int))]
     poses = sequence.T_world_camera.copy()
-    twists, before = disagreement(twin.surface, sequence, poses, some)
+    twists, before = disagreement(caster, sequence, poses, some)
     poses[some] = moved(poses[some], twists)
-    after = disagreement(twin.surface, sequence, poses, some)[1]
+    after = disagreement(caster, sequence, poses, some)[1]
     return 20 * float(np.log10(before / after)) if min(before, after) > 0 else 0.0
 
 
@@ -112,8 +110,9 @@ def registered(
     config = FuseConfig(**made.get("config", {}))
     now, surface = Corrections.none(sequence.T_world_camera), twin.surface
     for number in range(ROUNDS):
+        caster = Caster(surface)
         for _ in range(STEPS):
-            twists = disagreement(surface, sequence, now.poses, frames)[0]
+            twists = disagreement(caster, sequence, now.poses, frames)[0]
             now = now.stepped(np.zeros(len(now.shared)), twists, frames)
         factor = config.voxel * (1 if number == ROUNDS - 1 else COARSER)
         at_poses = replace(sequence, T_world_camera=now.poses)

@@ -40,13 +40,14 @@ class Scene:
     normals: np.ndarray
 
     @classmethod
-    def of(cls, surface: Surface, camera: Camera, count: int, seed: int = 0) -> Scene:
-        """With at most ``count`` vertices, drawn evenly from those that two training photos see."""
+    def of(cls, caster: Caster, camera: Camera, count: int, seed: int = 0) -> Scene:
+        """The surface of ``caster``, at most ``count`` vertices drawn from those that two photos see."""
+        surface = caster.surface
         seen = np.flatnonzero(surface.seen_by >= 2)
         if len(seen) > count:
             seen = np.sort(np.random.default_rng(seed).choice(seen, count, replace=False))
         points, normals = (x[seen].astype(np.float64) for x in (surface.vertices_mm, surface.normals))
-        return cls(surface, camera, Caster(surface), _by_direction(camera), seen, points, normals)
+        return cls(surface, camera, caster, _by_direction(camera), seen, points, normals)
 
     @property
     def shape(self) -> tuple[int, int]:

@@ -161,8 +161,7 @@ class Probe:
         self.twin, self.caster = twin, caster
         generator = np.random.default_rng(seed)
         rows = np.flatnonzero(diffuse(samples))
-        corner = samples.barycentric.argmax(dim=1).numpy()[rows]
-        vertex = surface.triangles[samples.triangle.numpy()[rows], corner]
+        vertex = samples.nearest(surface.triangles)[rows]
         chosen = _whole_groups(vertex, len(surface.vertices_mm), pixels, generator)
         self._rows = rows[chosen]
         self.samples = samples[torch.from_numpy(self._rows)]

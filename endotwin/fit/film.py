@@ -27,8 +27,8 @@ from endotwin.fit.gauss_newton import State
 from endotwin.fit.lighting import Relighting, exposed, lit
 from endotwin.fit.model import at_pixels, radiance
 from endotwin.light import shading
-from endotwin.light.film import Film, mirrored, mirrors
-from endotwin.light.guides import AT_LENS, visible_from
+from endotwin.light.film import Film, mirrored, mirrors_in_view
+from endotwin.light.guides import AT_LENS
 from endotwin.pixels.samples import Samples, Views, frame_samples
 from endotwin.run.ahead import ahead
 from endotwin.run.threads import THREADS
@@ -140,9 +140,7 @@ class Model:
         for done, part in enumerate(ahead(one, range(len(views.frames)), THREADS), 1):
             parts.append(part)
             report("find the film", done, len(views.frames))
-        names = [name for name, value in vars(parts[0]).items() if value is not None]
-        joined = {name: torch.cat([getattr(part, name) for part in parts]) for name in names}
-        return lit(Samples(**joined, views=views), twin.surface, self.caster, self.relighting.effects)
+        return lit(Samples.joined(parts, views), twin.surface, self.caster, self.relighting.effects)
 
 
 def _splatted(camera: Camera, points_mm: np.ndarray) -> np.ndarray:
@@ -181,9 +179,7 @@ class Based:
 
     def vertices(self) -> np.ndarray:
         """The vertices that glints are nearest to, ascending."""
-        samples, shines = self.samples, self.shines
-        corner = samples.barycentric[shines].argmax(dim=1).numpy()
-        return np.unique(self.model.twin.surface.triangles[samples.triangle[shines].numpy(), corner])
+        return np.unique(self.samples[self.shines].nearest(self.model.twin.surface.triangles))
 
     def most_db(self) -> float:
         """What explaining every glint would gain."""
@@ -355,16 +351,19 @@ def mirrors_of(
     the vertices ``vertex[place]`` in the views ``row`` (ascending), both [P]."""
     effects, surface = model.relighting.effects, model.twin.surface
     guides_mm = np.asarray(effects.guides_mm or AT_LENS, np.float32)
+    caster = model.caster if "shadows" in effects else None
     halves, strengths = [torch.zeros(0, len(guides_mm), 3)], [torch.zeros(0, len(guides_mm))]
     for view in np.unique(row):
-        pose = views.T_local_camera[view]
-        chosen = vertex[place[row == view]]
-        points_mm = ((surface.vertices_mm[chosen] - pose[:3, 3]) @ pose[:3, :3]).astype(np.float32)
-        visible = None
-        if "shadows" in effects:
-            visible = visible_from(model.caster, pose, points_mm, guides_mm)
-        half, strength = mirrors(points_mm, guides_mm, effects.profile, model.state.shared.log_light, visible)
-        halves.append(torch.from_numpy(half @ pose[:3, :3].T.astype(np.float32)))
+        points_mm = surface.vertices_mm[vertex[place[row == view]]]
+        half, strength = mirrors_in_view(
+            points_mm,
+            views.T_local_camera[view],
+            guides_mm,
+            effects.profile,
+            model.state.shared.log_light,
+            caster,
+        )
+        halves.append(torch.from_numpy(half))
         strengths.append(strength)
     return torch.cat(halves), torch.cat(strengths)
 

@@ -138,8 +138,7 @@ class Bouncer:
         _, n, q = shared.log_light
         scale, f0 = shared.log_scale, shared.f0 * math.exp(shared.log_scale)
         albedo = Albedo.of(self._radiosity, materials[:, :3], materials[:, 3], f0, triangles.numpy())
-        corner = samples.barycentric.argmax(dim=1).numpy()
-        vertex = self._surface.triangles[samples.triangle.numpy(), corner]
+        vertex = samples.nearest(self._surface.triangles)
         places = Places(self._radiosity.to_vertex[vertex], samples.views.row(samples.frame))
         gloss = shading.specular_of_even_light(samples.cos, roughness, f0) * math.exp(-scale)
         return replace(samples, bounce=self._light.expanded(places, n, q, albedo, gloss, scale))

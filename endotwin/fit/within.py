@@ -73,9 +73,7 @@ class Within:
 
     @classmethod
     def of(cls, samples: Samples, surface: Surface, unit_mm: float) -> Within:
-        corner = samples.barycentric.argmax(dim=1).numpy()
-        vertex = surface.triangles[samples.triangle.numpy(), corner]
-        return cls(samples, vertex, len(surface.vertices_mm), unit_mm)
+        return cls(samples, samples.nearest(surface.triangles), len(surface.vertices_mm), unit_mm)
 
     def renewed(self, material: Tensor, shared: Globals, held: tuple[str, ...], noise: float) -> Globals:
         """``shared`` after a Gauss–Newton step: light and response by what is off the highlights, then f0 and

@@ -15,8 +15,9 @@ import torch
 from torch import Tensor
 
 from endotwin.light import shading
-from endotwin.light.guides import log_axis
+from endotwin.light.guides import log_axis, visible_from
 from endotwin.light.incidence import COS_MIN, DISTANCE_MIN_MM
+from endotwin.surface.casting import Caster
 from endotwin.surface.vectors import dot, unit
 
 
@@ -37,11 +38,11 @@ class Film:
     def __len__(self) -> int:
         return len(self.vertex)
 
-    def on_all(self, count: int) -> np.ndarray:
-        """Weights of all ``count`` vertices of the surface, float32 [count]: 0 where no film is known."""
-        weight = np.zeros(count, np.float32)
-        weight[self.vertex] = self.weight
-        return weight
+    def on_all(self, values: np.ndarray, count: int) -> np.ndarray:
+        """``values`` [M] on all ``count`` vertices of the surface, float32 [count]: 0 where no film is."""
+        everywhere = np.zeros(count, np.float32)
+        everywhere[self.vertex] = values
+        return everywhere
 
 
 def mirrored(strength: Tensor, sin2: Tensor, roughness: float) -> Tensor:
@@ -81,3 +82,20 @@ def mirrors(
     if visible is not None:
         strength = strength * torch.from_numpy(visible)
     return unit(wi + unit(-points_mm)[:, None]), strength
+
+
+def mirrors_in_view(
+    points_mm: np.ndarray,
+    T_local_camera: np.ndarray,
+    guides_mm: np.ndarray,
+    profile: float,
+    log_light: tuple[float, float, float],
+    caster: Caster | None,
+) -> tuple[np.ndarray, Tensor]:
+    """``mirrors`` of ``points_mm`` [N, 3], with half vectors, in the surface's frame, in the view from
+    ``T_local_camera`` [4, 4]; guides are dark where the surface of ``caster`` hides them (None: nowhere)."""
+    rotation = T_local_camera[:3, :3]
+    seen_mm = ((points_mm - T_local_camera[:3, 3]) @ rotation).astype(np.float32)
+    visible = None if caster is None else visible_from(caster, T_local_camera, seen_mm, guides_mm)
+    half, strength = mirrors(seen_mm, guides_mm, profile, log_light, visible)
+    return half @ rotation.T.astype(np.float32), strength

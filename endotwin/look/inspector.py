@@ -89,7 +89,8 @@ def twin_maps(twin: Twin) -> dict[str, Map]:
             values = getattr(twin.materials, name)
             maps[name] = Map(name, values, _limits(values))
         if twin.materials.film is not None:
-            wet = twin.materials.film.on_all(len(surface.vertices_mm))
+            film = twin.materials.film
+            wet = film.on_all(film.weight, len(surface.vertices_mm))
             maps["film"] = Map("film of fluid: mirrored light", wet, _limits(wet[wet > 0]))
     most = max(int(surface.seen_by.max(initial=0)), 2)
     maps["coverage"] = Map("coverage: training frames", surface.seen_by, (1, most), "%.0f", "unseen")

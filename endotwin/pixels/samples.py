@@ -102,6 +102,18 @@ class Samples:
             return self
         return self._each(lambda value: value.to(device))
 
+    @classmethod
+    def joined(cls, parts: list[Samples], views: Views) -> Samples:
+        """The samples of all ``parts``, in their order."""
+        names = [name for name, value in vars(parts[0]).items() if value is not None]
+        return cls(
+            **{name: torch.cat([getattr(part, name) for part in parts]) for name in names}, views=views
+        )
+
+    def nearest(self, triangles: np.ndarray) -> np.ndarray:
+        """The vertex that each is nearest to, int [N], among the corners of ``triangles`` [F, 3]."""
+        return triangles[self.triangle.numpy(), self.barycentric.argmax(dim=1).numpy()]
+
     @property
     def directions(self) -> np.ndarray:
         """Unit viewing rays in the camera frame, float32 [N, 3]."""
@@ -165,12 +177,11 @@ def gather(twin: Twin, pace: Pace, seed: int, caster: Caster) -> Samples:
         if len(part) and not tells and any(shows):
             logger.warning("%s is black or clipped and is not fitted", sequence.color_files[index])
     parts = [part for part, tells in zip(parts, shows, strict=True) if tells or not any(shows)]
-    columns = [name for name, value in vars(parts[0]).items() if value is not None]
-    joined = Samples(**{name: torch.cat([getattr(part, name) for part in parts]) for name in columns})
-    shown = np.unique(joined.frame.numpy())
+    shown = np.unique(torch.cat([part.frame for part in parts]).numpy())
     T_local_camera = twin.surface.to_local(sequence.T_world_camera[shown])
     views = Views(twin.camera, sequence.lens_mask, shown, T_local_camera)
-    return replace(joined[torch.argsort(joined.triangle, stable=True)], views=views)
+    joined = Samples.joined(parts, views)
+    return joined[torch.argsort(joined.triangle, stable=True)]
 
 
 def _shown(part: Samples) -> float:

@@ -70,7 +70,7 @@ def closed_form(samples: Samples, triangles: np.ndarray, vertex_count: int) -> S
     Returns:
         a Start whose base_color is float32 [V, 3], with the median where no sample is.
     """
-    vertex = triangles[samples.triangle.numpy(), samples.barycentric.argmax(dim=1).numpy()]
+    vertex = samples.nearest(triangles)
     gamma, n, q, undetermined = _coefficients(samples, vertex, vertex_count)
     return _start(samples, vertex, vertex_count, Light(0.0, n, q), gamma, undetermined)
 
@@ -78,7 +78,7 @@ def closed_form(samples: Samples, triangles: np.ndarray, vertex_count: int) -> S
 def start_at(samples: Samples, triangles: np.ndarray, vertex_count: int, light: Light, gamma: float) -> Start:
     """A start from a given light and response, as ``closed_form`` returns it; an L0 of 0 is chosen as
     there."""
-    vertex = triangles[samples.triangle.numpy(), samples.barycentric.argmax(dim=1).numpy()]
+    vertex = samples.nearest(triangles)
     return _start(samples, vertex, vertex_count, light, gamma, ())
 
 

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from endotwin.light import shading
 from endotwin.light.bounced import Albedo, BouncedLight, Places
-from endotwin.light.film import mirrored, mirrors
+from endotwin.light.film import mirrored, mirrors_in_view
 from endotwin.light.forward import Lit, Lobes, radiance
 from endotwin.light.guides import AT_LENS, COSINE, guided, log_axis, visible_from
 from endotwin.light.incidence import COS_MIN, incidence_on
@@ -60,18 +60,18 @@ class Illumination:
         twin, effects, film = self.twin, self.twin.effects, self.twin.materials.film
         if film is None or "film" not in effects:
             return None
-        guides_mm = np.asarray(effects.guides_mm or AT_LENS, np.float32)
-        rotation = T_local_camera[:3, :3].astype(np.float32)
-        points_mm = (twin.surface.vertices_mm[film.vertex] - T_local_camera[:3, 3]) @ T_local_camera[:3, :3]
-        points_mm, visible = points_mm.astype(np.float32), None
-        if "shadows" in effects:
-            visible = visible_from(self._caster, T_local_camera, points_mm, guides_mm)
-        half, strength = mirrors(points_mm, guides_mm, effects.profile, _log_light(twin), visible)
-        across = np.cross((film.normal @ rotation)[:, None], half)
+        half, strength = mirrors_in_view(
+            twin.surface.vertices_mm[film.vertex],
+            T_local_camera,
+            np.asarray(effects.guides_mm or AT_LENS, np.float32),
+            effects.profile,
+            _log_light(twin),
+            self._caster if "shadows" in effects else None,
+        )
+        across = np.cross(film.normal[:, None], half)
         lobe = mirrored(strength, torch.from_numpy(dot(across, across)), effects["film"].roughness).sum(dim=1)
-        radiance = np.zeros(len(twin.surface.vertices_mm), np.float32)
-        radiance[film.vertex] = effects["film"].amount * film.weight * lobe.numpy()
-        return radiance
+        radiance = effects["film"].amount * film.weight * lobe.numpy()
+        return film.on_all(radiance, len(twin.surface.vertices_mm))
 
     def _bounced(self, T_local_camera: np.ndarray) -> np.ndarray:
         """Indirect irradiance of the vertices, float32 [V, 3], with L0 = 1."""

@@ -108,10 +108,13 @@ class Labeller:
             )
             images = {"rgb": color, "rgb_linear": radiance, "rgb_exr": radiance}
         if specular_free is not None:
-            view = view or renderer.view(T_world_camera)
-            images["diffuse"] = specular_free.view(T_world_camera).color
-            images["specular"] = view.color - images["diffuse"]
-            images["highlights"] = np.uint8(255 * (images["specular"].min(axis=2) > HIGHLIGHT))
+            matt = specular_free.view(T_world_camera)
+            images["diffuse"] = matt.color
+            if "specular" in job.labels:
+                view = view or renderer.view(T_world_camera)
+                images["specular"] = view.color - matt.color
+                images["highlights"] = np.uint8(255 * (images["specular"].min(axis=2) > HIGHLIGHT))
+            view = view or matt
         hits = view.hits if view else self._caster.cast(job.camera, T_world_camera)
         geometry = _Geometry(job, self._caster, hits, index, self._kinds, renderer, view)
         for name in job.images:
