@@ -17,6 +17,9 @@ PATIENCE_S = 1.2
 TIDY_S = 8.0
 """Time that it then has to tidy up after itself; what it leaves then, the next one sweeps."""
 
+UNINTERRUPTED = ("<frozen importlib._bootstrap>", "_workplace")
+"""A file and a function (of ``run.output``) within which a signal waits."""
+
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 _heeded = Event()
@@ -60,8 +63,9 @@ def _end_after(listening: socket.socket) -> None:
 
 
 def _stop(number: int, frame: FrameType | None) -> None:
-    """Raise Stopped, or try again soon: a library that is being imported would make an ImportError of it."""
-    if not _importing(frame):
+    """Raise Stopped, or try again soon: a library that is being imported would make an ImportError of it, and
+    a workplace that is being made or removed would stay."""
+    if not _within(frame, *UNINTERRUPTED):
         _heeded.set()
         raise Stopped(number)
     if hasattr(signal, "setitimer"):
@@ -73,7 +77,8 @@ def _stop(number: int, frame: FrameType | None) -> None:
         again.start()
 
 
-def _importing(frame: FrameType | None) -> bool:
-    while frame is not None and frame.f_code.co_filename != "<frozen importlib._bootstrap>":
+def _within(frame: FrameType | None, *places: str) -> bool:
+    """Whether ``frame`` was called from one of the files or functions ``places``."""
+    while frame is not None and not {frame.f_code.co_filename, frame.f_code.co_name} & {*places}:
         frame = frame.f_back
     return frame is not None

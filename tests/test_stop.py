@@ -36,10 +36,33 @@ from threading import Timer
 from endotwin.cli import effects, start
 from endotwin.twin import Twin
 
-Timer(0.1, os.kill, (os.getpid(), signal.SIGINT)).start()
-Twin.load = lambda path: hashlib.pbkdf2_hmac("sha256", b"", b"", 2_000_000_000)
+def load(path):
+    Timer(0.1, os.kill, (os.getpid(), signal.SIGINT)).start()
+    hashlib.pbkdf2_hmac("sha256", b"", b"", 2_000_000_000)
+
+Twin.load = load
 sys.argv = ["endotwin", "effects", "nowhere"]
 start.main()
+"""
+
+
+TIDYING = """
+import os, shutil, signal, sys
+from endotwin.cli.stop import Stopped, heed_signals, tell
+from endotwin.run import output
+
+def rmtree(path, **options):
+    os.kill(os.getpid(), signal.SIGINT)
+    remove(path, **options)
+
+remove, shutil.rmtree = shutil.rmtree, rmtree
+heed_signals()
+try:
+    with output.whole_file(sys.argv[1]) as file:
+        file.write_text("{}")
+    signal.pause()
+except Stopped as stopped:
+    sys.exit(tell(stopped))
 """
 
 
@@ -100,6 +123,13 @@ def test_ctrl_c_within_a_long_call_of_c_code_is_one_line():
     process = started("-c", BUSY)
     said = process.communicate(timeout=PATIENT_S)[1]
     assert (process.returncode, said) == (130, "stopped\n")
+
+
+def test_ctrl_c_while_a_workplace_is_removed_leaves_nothing_behind(tmp_path):
+    process = started("-c", TIDYING, tmp_path / "profile.json")
+    said = process.communicate(timeout=PATIENT_S)[1]
+    assert process.returncode == 130 and said.startswith("stopped")
+    assert [path.name for path in tmp_path.iterdir()] == ["profile.json"]
 
 
 def test_the_installed_command_begins_where_ctrl_c_is_heeded():
