@@ -30,7 +30,7 @@ def test_light_at_the_lens_is_one_guide_at_the_origin():
     at_lens = Lit.at_lens(*map(torch.from_numpy, columns))
     beside = Lit(torch.from_numpy(cos), guided(points_mm, normals, np.array(AT_LENS), COSINE))
     material = test_model.made_materials(500)
-    lobes = Lobes(0.04, coat=(0.7, 0.2))
+    lobes = Lobes(0.04, coat=(0.7, 0.2, 2.0))
     both = [
         forward.radiance(lit, LOG_LIGHT, material[:, :3], material[:, 3], lobes) for lit in (at_lens, beside)
     ]
@@ -53,13 +53,13 @@ def test_exposure_scales_all_light():
     samples, material = test_model.in_a_tube(test_model.made_samples(100, 17)), test_model.made_materials(100)
     dark = samples.lit(*LOG_LIGHT[1:])
     bright = replace(dark, log_exposure=torch.full((100,), 0.3, dtype=torch.float64))
-    arguments = LOG_LIGHT, material[:, :3], material[:, 3], Lobes(0.04, coat=(0.7, 0.2))
+    arguments = LOG_LIGHT, material[:, :3], material[:, 3], Lobes(0.04, coat=(0.7, 0.2, 2.0))
     ratio = forward.radiance(bright, *arguments) / forward.radiance(dark, *arguments)
     torch.testing.assert_close(ratio, torch.full_like(ratio, float(np.exp(0.3))))
 
 
 @pytest.mark.parametrize("scene", test_model.SCENES)
-@pytest.mark.parametrize("coat", [None, Coat(0.6, 0.2)])
+@pytest.mark.parametrize("coat", [None, Coat(0.6, 0.2), Coat(0.6, 0.2, tail=1.0)])
 def test_the_derivatives_of_least_squares_are_those_of_automatic_differentiation(scene, coat):
     """By base colour, roughness, coat and, at the displayed colour b^γ, by γ·ln L0, γn, γq, γ and ln f0."""
     samples = test_model.SCENES[scene](test_model.made_samples(40, 17))
@@ -70,7 +70,9 @@ def test_the_derivatives_of_least_squares_are_those_of_automatic_differentiation
     def predicted(vector, roughness, weight):
         log_L0, n, q = vector[:3] / vector[3]
         scale = vector[5] if len(vector) > 5 else 0.0
-        lobes = Lobes(torch.exp(vector[4]), coat=None if coat is None else (weight, coat.roughness))
+        lobes = Lobes(
+            torch.exp(vector[4]), coat=None if coat is None else (weight, coat.roughness, coat.tail)
+        )
         color = shown ** (1 / vector[3])
         x = forward.radiance(samples.lit(n, q, scale), (log_L0, n, q), color, roughness, lobes)
         return shading.respond(x, vector[3])

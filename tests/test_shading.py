@@ -56,6 +56,20 @@ def random_pairs(count: int) -> tuple[np.ndarray, np.ndarray]:
     return pair[0], pair[1]
 
 
+@pytest.mark.parametrize("roughness", ROUGHNESS)
+def test_a_tail_of_2_is_ggx_and_one_of_1_is_burleys_clearcoat(roughness):
+    """Burley 2012, appendix B.2: (α² − 1) / (π·ln α²·(1 + (α² − 1)·cos²))."""
+    cos2, alpha = np.linspace(0, 1, 50), t64(roughness**2)
+    close = {"rtol": 1e-5, "atol": 0}
+    torch.testing.assert_close(
+        shading.gtr(t64(1 - cos2), alpha, 2.0), shading.ggx(t64(1 - cos2), alpha), **close
+    )
+    if roughness < 1:
+        alpha2 = roughness**4
+        expected = (alpha2 - 1) / (math.pi * math.log(alpha2) * (1 + (alpha2 - 1) * cos2))
+        torch.testing.assert_close(shading.gtr(t64(1 - cos2), alpha, 1.0), t64(expected), **close)
+
+
 def test_ggx_is_walters_distribution():
     cos_m, roughness = grid(COS, ROUGHNESS)
     expected = ggx(cos_m, roughness**2)
@@ -125,13 +139,14 @@ def test_lobes_are_reciprocal():
 
 
 @pytest.mark.parametrize("roughness", ROUGHNESS)
-def test_ggx_microfacets_cover_the_surface_exactly_once(roughness):
+@pytest.mark.parametrize("tail", (1.0, 1.0001, 1.5, 2.0))
+def test_microfacets_cover_the_surface_exactly_once_whatever_their_tail(roughness, tail):
     """∫ D(wm)·(n·wm) dwm = 1 over the hemisphere."""
 
     def integrand(log_tan: float) -> float:
         tan2 = math.exp(2 * log_tan)
         cos2 = 1 / (1 + tan2)
-        density = float(shading.ggx(t64(tan2 * cos2), t64(roughness**2)))
+        density = float(shading.gtr(t64(tan2 * cos2), t64(roughness**2), tail))
         return 2 * math.pi * density * cos2 * tan2 * cos2
 
     assert quad(integrand, -16, 12, limit=400)[0] == pytest.approx(1, abs=1e-6)

@@ -13,7 +13,7 @@ from endotwin.config import FitConfig
 from endotwin.effects import Effects
 from endotwin.fit import fit
 from endotwin.fit.gauss_newton import GaussNewton
-from endotwin.fit.tilt import tilted
+from endotwin.fit.tilt import Tilter
 from endotwin.surface.vectors import unit
 
 pytestmark = pytest.mark.slow
@@ -53,7 +53,8 @@ def test_with_the_true_materials_disturbed_normals_are_found_again():
     solver = GaussNewton(samples, surface.triangles, state.operator)
     off = np.radians(0.5) * np.random.default_rng(0).normal(size=surface.normals.shape)
     disturbed = unit((surface.normals + off).astype(np.float32))
-    found = tilted(tilted(disturbed, solver, state, Effects()), solver, state, Effects())
+    tilter = Tilter(solver, state, Effects())
+    found = tilter.tilted(tilter.tilted(disturbed))
     seen = np.bincount(surface.triangles[samples.triangle.numpy()].ravel(), minlength=len(found)) > 60
 
     def off_deg(normals: np.ndarray) -> float:

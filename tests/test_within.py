@@ -64,10 +64,11 @@ def test_light_response_and_f0_are_found_beside_an_albedo_that_is_nowhere_right(
     assert told(shared) == pytest.approx(told(TRUE), rel=0.01)
 
 
-def test_a_coat_is_found_with_its_roughness_and_weight():
-    within, material = photographed(replace(TRUE, coat=Coat(0.8, 0.19)))
+@pytest.mark.parametrize("tail", [1.0, 2.0])
+def test_a_coat_is_found_with_its_roughness_tail_and_weight(tail):
+    within, material = photographed(replace(TRUE, coat=Coat(0.8, 0.19, tail)))
     coat, decision = judged(within.highlights(material, TRUE, NOISE), "auto")
-    assert decision.state == "on" and coat.roughness == 0.19
+    assert decision.state == "on" and (coat.roughness, coat.tail) == (0.19, tail)
     shared = replace(TRUE, coat=coat)
     for _ in range(6):
         shared = within.renewed(material, shared, (), NOISE)

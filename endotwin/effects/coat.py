@@ -10,7 +10,9 @@ from endotwin.effects.effect import Effect, parameter
 
 @dataclass(frozen=True)
 class Coat(Effect):
-    """A second GGX lobe, weight·D·F·G/4(n·ωi)(n·ωo) with F = 0.02 of water (Burley 2012, clearcoat).
+    """A second lobe, weight·D·F·G/4(n·ωi)(n·ωo) with F = 0.02 of water (Burley 2012, clearcoat).
+
+    D is generalised Trowbridge–Reitz: GGX for a ``tail`` of 2, Burley's own coat, with a far haze, for 1.
 
     It adds to the other lobes; what it takes from them (at most 4 %) is left to the fitted base colour.
     """
@@ -18,3 +20,9 @@ class Coat(Effect):
     name: ClassVar[str] = "coat"
     weight: float = parameter(1.0, 0.0, 50.0)
     roughness: float = parameter(0.12, 0.045, 1.0)
+    tail: float = parameter(2.0, 1.0, 2.0)
+
+    @property
+    def lobe(self) -> tuple[float, float, float]:
+        """Weight, roughness and tail."""
+        return self.weight, self.roughness, self.tail

@@ -14,6 +14,7 @@ from endotwin.evidence.probe import Verdict, compared
 from endotwin.pixels.fixed_effects import Design, regress, robust_losses
 
 ROUGHNESSES = (0.06, 0.09, 0.13, 0.19, 0.27)
+TAILS = (2.0, 1.0)
 LEAST_SIGHTINGS = 16
 
 SEARCH_ROUNDS = 2
@@ -34,12 +35,18 @@ class Highlights:
     by_f0: np.ndarray
     by_coat: np.ndarray
 
+    @property
+    def design(self) -> Design:
+        """f0 and coat, beside an intercept a vertex."""
+        vertex = np.unique(self.vertex, return_inverse=True)[1].reshape(-1)
+        return Design(np.c_[self.by_f0, self.by_coat], vertex, int(vertex.max()) + 1)
 
-def judged(under: Callable[[float], Highlights], wanted: str) -> tuple[Coat | None, Decision]:
+
+def judged(under: Callable[[Coat], Highlights], wanted: str) -> tuple[Coat | None, Decision]:
     """The coat that the highlights call for, or that is ``wanted`` (auto, on or off); and why.
 
     Args:
-        under: the highlights, by the roughness of the coat whose weight is sought.
+        under: the highlights, by the coat whose weight is sought.
     """
     if wanted == "off":
         return None, Decision("off", "forced off")
@@ -54,24 +61,35 @@ def judged(under: Callable[[float], Highlights], wanted: str) -> tuple[Coat | No
     return coat, Decision("on", reason, round(verdict.gain_db, 3), took_s)
 
 
-def best_coat(under: Callable[[float], Highlights]) -> tuple[Coat, Verdict]:
+def best_coat(under: Callable[[Coat], Highlights]) -> tuple[Coat, Verdict]:
     """The coat that predicts highlights best, and by how much better than none it does on vertices that did
-    not choose its weight."""
+    not choose its weight.
+
+    Lobes are ranked by what they leave after a second step, since a coat may outshine what is under it, where
+    the logarithm is far from linear in its weight.
+    """
     width, least, best = 0.0, np.inf, None
-    for roughness in ROUGHNESSES:
-        seen = under(roughness)
+    for lobe in (Coat(0.0, roughness, tail) for tail in TAILS for roughness in ROUGHNESSES):
+        seen = under(lobe)
         if len(seen.residual) < LEAST_SIGHTINGS:
             break
-        vertex = np.unique(seen.vertex, return_inverse=True)[1].reshape(-1)
-        coated = Design(np.c_[seen.by_f0, seen.by_coat], vertex, int(vertex.max()) + 1)
-        plain = replace(coated, columns=coated.columns[:, :1])
-        width = width or regress(seen.residual, plain).width
-        found = regress(seen.residual, coated, rounds=SEARCH_ROUNDS)
-        loss = float(robust_losses(seen.residual, coated, found, width).sum())
-        if found.coefficients[1] > 0 and loss < least:
-            least, best = loss, (Coat(float(found.coefficients[1]), roughness), seen.residual, plain, coated)
+        width = width or regress(seen.residual, _bare(seen.design)).width
+        weight = float(regress(seen.residual, seen.design, rounds=SEARCH_ROUNDS).coefficients[1])
+        if weight <= 0:
+            continue
+        near = under(replace(lobe, weight=weight))
+        found = regress(near.residual, near.design, rounds=SEARCH_ROUNDS)
+        loss = float(robust_losses(near.residual, near.design, found, width).mean())
+        if loss < least:
+            least, best = loss, (replace(lobe, weight=weight + float(found.coefficients[1])), seen)
     if best is None:
-        return Coat(0.0, ROUGHNESSES[0]), Verdict(0.0, 0.0)
-    coat, residual, plain, coated = best
-    half = (np.random.default_rng(0).random(plain.count) < 0.5)[plain.group]
-    return coat, compared(residual, plain, coated, half, width)
+        return Coat(0.0), Verdict(0.0, 0.0)
+    coat, seen = best
+    half = (np.random.default_rng(0).random(seen.design.count) < 0.5)[seen.design.group]
+    verdict = compared(seen.residual, _bare(seen.design), seen.design, half, width)
+    return replace(coat, weight=max(0.0, coat.weight)), verdict
+
+
+def _bare(design: Design) -> Design:
+    """``design`` without its coat."""
+    return replace(design, columns=design.columns[:, :1])

@@ -161,14 +161,14 @@ class GaussNewton:
         self.held: tuple[str, ...] = ()
         self.out_of_time = out_of_time
         chosen = drawn(len(samples), SEARCH_SAMPLES, np.random.default_rng(seed))
-        self._trial_rows = torch.from_numpy(chosen)
+        self.trial_rows = torch.from_numpy(chosen)
         self.relight(samples)
         self.squared_adjoint = _squared(self._operator.adjoint_csr)
 
     def relight(self, samples: Samples) -> None:
         """Go on with the same samples under other light or exposure."""
         self.samples = samples
-        self._trial, self._placed = samples[self._trial_rows].to(self._device), None
+        self._trial, self._placed = samples[self.trial_rows].to(self._device), None
 
     def _global_prior(self, state: State) -> tuple[Tensor, Tensor]:
         return global_prior(self._unit_mm, len(state.shared.vector))

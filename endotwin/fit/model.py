@@ -62,8 +62,7 @@ class Globals:
 
     @property
     def lobes(self) -> Lobes:
-        coat = None if self.coat is None else (self.coat.weight, self.coat.roughness)
-        return Lobes(self.f0, coat=coat)
+        return Lobes(self.f0, coat=None if self.coat is None else self.coat.lobe)
 
     def without_scale(self) -> Globals:
         """The same without interreflection."""

@@ -32,7 +32,7 @@ from endotwin.fit.gauss_newton import (
 from endotwin.fit.hashgrid import HashGrid, HashOperator
 from endotwin.fit.lighting import Relighting, lit
 from endotwin.fit.model import Globals, at_pixels
-from endotwin.fit.tilt import tilted
+from endotwin.fit.tilt import Tilter
 from endotwin.fit.unexplained import residual_warning
 from endotwin.fit.within import Within
 from endotwin.light.film import Film
@@ -303,10 +303,11 @@ def _find_detail(
         state, _ = solver.step(state, joint=False)
         step_s = pace.stopwatch.total - before
         pace.report("find the detail", number + 1, pace.plan.steps)
+    tilter = Tilter(solver, state, relighting.effects)
     for number in range(pace.plan.tilts):
         if pace.left(ITERATIONS) <= step_s / 2:
             break
-        normals = tilted(normals, solver, state, relighting.effects)
+        normals = tilter.tilted(normals)
         pace.report("tilt the normals", number + 1, pace.plan.tilts)
     return state, normals, solver.noise(state)
 

@@ -7,7 +7,7 @@ about the normal that it had: photometric stereo (Woodham 1980) with a moving li
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -16,7 +16,7 @@ from torch import Tensor
 from endotwin.effects import Effects
 from endotwin.fit.gauss_newton import HUBER, TEMPER, GaussNewton, State, conjugate_gradients
 from endotwin.fit.model import at_pixels, predict
-from endotwin.fit.normal_equations import CHUNK, MeshPattern, Residual, add_products, pairs_of
+from endotwin.fit.normal_equations import CHUNK, Residual, add_products, pairs_of
 from endotwin.light.guides import guided
 from endotwin.light.incidence import COS_MIN
 from endotwin.pixels.samples import Samples
@@ -28,73 +28,104 @@ SPREAD_DEG = 0.5
 TILT_STEP = 2e-3
 """Step of the finite differences, in radians."""
 
+STEEP_DEG, STEEP = 0.1, 5.0
+"""A pixel whose channels' sum changes by so many times the noise, tilted by STEEP_DEG, is steep."""
+
+LEAST_STEEP = 100
+
 AXIS_PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 
 
-def tilted(normals: np.ndarray, solver: GaussNewton, state: State, effects: Effects) -> np.ndarray:
-    """The unit ``normals`` [V, 3] of the vertices, tilted to what the samples of ``solver`` show."""
-    samples, pattern = solver.samples, solver.pattern
-    noise = solver.noise(state)
-    scale = 1 / (noise**2 * TEMPER)
-    sums, right = _assembled(normals, samples, pattern, solver.triangles, state, effects, HUBER * noise)
-    blocks = {pair: pattern.matrix(sums[:, :, k] * scale) for k, pair in enumerate(AXIS_PAIRS)}
-    blocks |= {(j, i): block for (i, j), block in blocks.items()}
-    precision = 1 / np.radians(SPREAD_DEG) ** 2
+@dataclass(frozen=True)
+class Tilter:
+    """Tilts normals to what the samples of ``solver`` show under the ``state``'s materials, light and
+    response."""
 
-    def product(x: Tensor) -> Tensor:
-        rows = [sum(blocks[i, j] @ x[:, j] for j in range(3)) + precision * x[:, i] for i in range(3)]
-        return torch.stack(rows, dim=1)
+    solver: GaussNewton
+    state: State
+    effects: Effects
 
-    ones = torch.ones(len(normals), 1)
-    lumped = torch.stack([blocks[i, j] @ ones for i in range(3) for j in range(3)], 1).reshape(-1, 3, 3)
-    inverse = torch.linalg.inv(lumped + precision * torch.eye(3))
-    right = torch.from_numpy(pattern.vector(right).astype(np.float32) * np.float32(scale))[..., None]
-    tilt = conjugate_gradients(product, right, inverse, solver.out_of_time)[..., 0].numpy()
-    return unit(normals + tilt)
+    def tilted(self, normals: np.ndarray) -> np.ndarray:
+        """The unit ``normals`` [V, 3] after one step."""
+        pattern, noise = self.solver.pattern, self.solver.noise(self.state)
+        scale = 1 / (noise**2 * TEMPER)
+        sums, right = self._assembled(normals, noise, self._between(normals, noise))
+        blocks = {pair: pattern.matrix(sums[:, :, k] * scale) for k, pair in enumerate(AXIS_PAIRS)}
+        blocks |= {(j, i): block for (i, j), block in blocks.items()}
+        precision = 1 / np.radians(SPREAD_DEG) ** 2
 
+        def product(x: Tensor) -> Tensor:
+            rows = [sum(blocks[i, j] @ x[:, j] for j in range(3)) + precision * x[:, i] for i in range(3)]
+            return torch.stack(rows, dim=1)
 
-def _assembled(
-    normals: np.ndarray,
-    samples: Samples,
-    pattern: MeshPattern,
-    triangles: Tensor,
-    state: State,
-    effects: Effects,
-    width: float,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Sums over the samples of each triangle, by the tilt of its corners along the world's axes.
+        ones = torch.ones(len(normals), 1)
+        lumped = torch.stack([blocks[i, j] @ ones for i in range(3) for j in range(3)], 1).reshape(-1, 3, 3)
+        inverse = torch.linalg.inv(lumped + precision * torch.eye(3))
+        right = torch.from_numpy(pattern.vector(right).astype(np.float32) * np.float32(scale))
+        tilt = conjugate_gradients(product, right[..., None], inverse, self.solver.out_of_time)
+        return unit(normals + tilt[..., 0].numpy())
 
-    Returns:
-        JᵀWJ float32 [T, 6, 6] by CORNER_PAIRS and AXIS_PAIRS; JᵀWe float32 [T, 3, 3] by corner and axis.
-    """
-    count = len(pattern.corners)
-    sums, right = np.zeros((count, 6, 6), np.float32), np.zeros((count, 3, 3), np.float32)
-    rotations = samples.views.T_local_camera[:, :3, :3].astype(np.float32)
-    materials, corner_normals = state.materials, torch.from_numpy(normals)
-    for start, part in zip(range(0, len(samples), CHUNK), samples.chunks(CHUNK), strict=True):
-        rotation, view = rotations[part.views.row(part.frame)], part.directions
-        normal = at_pixels(part, triangles, corner_normals).numpy()
+    def _between(self, normals: np.ndarray, noise: float) -> float:
+        """Standard deviation in radians of a pixel's normal about that of its vertices, from pixels so steep
+        that their residual is of little else; 0 where they are few.
+
+        Sharp highlights are steep: their residuals are many times the noise, and yet say no more of a normal
+        than this.
+        """
+        drawn = self.solver.samples[self.solver.trial_rows]
+        _, slopes, residual = self._slopes(drawn, normals, np.inf)
+        slope, error = slopes.sum(dim=1), residual.error.sum(dim=1)
+        steep = residual.weight.all(dim=1) & (slope.abs() * np.radians(STEEP_DEG) > STEEP * noise)
+        if int(steep.sum()) < LEAST_STEEP:
+            return 0.0
+        return 1.4826 * float((error[steep] / slope[steep]).abs().median())
+
+    def _assembled(self, normals: np.ndarray, noise: float, between: float) -> tuple[np.ndarray, np.ndarray]:
+        """Sums over the samples of each triangle, by the tilt of its corners along the world's axes.
+
+        Args:
+            noise: of a pixel, in display values. between: of its normal, in radians.
+
+        Returns:
+            JᵀWJ float32 [T, 6, 6] by CORNER_PAIRS and AXIS_PAIRS; JᵀWe float32 [T, 3, 3] by corner and axis.
+        """
+        samples, pattern = self.solver.samples, self.solver.pattern
+        count = len(pattern.corners)
+        sums, right = np.zeros((count, 6, 6), np.float32), np.zeros((count, 3, 3), np.float32)
+        for start, part in zip(range(0, len(samples), CHUNK), samples.chunks(CHUNK), strict=True):
+            axis, slope, residual = self._slopes(part, normals, HUBER * noise)
+            certain = residual.weight / (1 + (slope * (between / noise)) ** 2)
+            weight = (certain * slope * slope).sum(dim=1).numpy()
+            pull = (certain * slope * residual.error).sum(dim=1).numpy()
+            ids = pattern.compact[start : start + len(part)]
+            corner = part.barycentric.numpy()
+            along = np.stack([weight * axis[:, i] * axis[:, j] for i, j in AXIS_PAIRS], axis=1)
+            add_products(sums, ids, pairs_of(corner), along)
+            add_products(right, ids, corner, pull[:, None] * axis)
+        return sums, right
+
+    def _slopes(
+        self, samples: Samples, normals: np.ndarray, width: float
+    ) -> tuple[np.ndarray, Tensor, Residual]:
+        """By which tilt N samples change most: its axis in the surface's frame [N, 3], and dC by its
+        radians [N, 3]; and their residuals, robust beyond ``width``."""
+        rotation = samples.views.T_local_camera[:, :3, :3].astype(np.float32)
+        rotation, view = rotation[samples.views.row(samples.frame)], samples.directions
+        normal = at_pixels(samples, self.solver.triangles, torch.from_numpy(normals)).numpy()
         normal = unit(np.einsum("na,nab->nb", normal, rotation))
-        material = at_pixels(part, triangles, materials)
+        material = at_pixels(samples, self.solver.triangles, self.state.materials)
 
-        predicted = predict(_seen(part, normal, view, effects), material, state.shared)
+        def shown(tilted: np.ndarray) -> Tensor:
+            return predict(_seen(samples, tilted, view, self.effects), material, self.state.shared)
+
+        predicted = shown(normal)
         towards = unit(-view + dot(normal, view)[:, None] * normal)
-        axes = [towards] if part.guides is None else [towards, np.cross(normal, towards)]
-        slopes = []
-        for axis in axes:
-            seen = _seen(part, unit(normal + np.float32(TILT_STEP) * axis), view, effects)
-            slopes.append((predict(seen, material, state.shared) - predicted) / TILT_STEP)
+        axes = [towards] if samples.guides is None else [towards, np.cross(normal, towards)]
+        slopes = [
+            (shown(unit(normal + np.float32(TILT_STEP) * axis)) - predicted) / TILT_STEP for axis in axes
+        ]
         axis, slope = _steepest(axes, slopes)
-        residual = Residual.of(part, predicted, width)
-        weight = (residual.weight * slope * slope).sum(dim=1).numpy()
-        pull = (residual.weight * slope * residual.error).sum(dim=1).numpy()
-        axis = np.einsum("nb,nab->na", axis, rotation)
-        ids = pattern.compact[start : start + len(part)]
-        corner = part.barycentric.numpy()
-        along = np.stack([weight * axis[:, i] * axis[:, j] for i, j in AXIS_PAIRS], axis=1)
-        add_products(sums, ids, pairs_of(corner), along)
-        add_products(right, ids, corner, pull[:, None] * axis)
-    return sums, right
+        return np.einsum("nb,nab->na", axis, rotation), slope, Residual.of(samples, predicted, width)
 
 
 def _seen(samples: Samples, normal: np.ndarray, view: np.ndarray, effects: Effects) -> Samples:

@@ -89,8 +89,8 @@ class Within:
             return shared
         return self._step(material, shared, ("level", "n", "q", "gamma"), torch.ones_like(diffuse), noise)
 
-    def highlights(self, material: Tensor, shared: Globals, noise: float) -> Callable[[float], Highlights]:
-        """Sightings near the mirror direction, by the roughness of a coat of weight 0 over them.
+    def highlights(self, material: Tensor, shared: Globals, noise: float) -> Callable[[Coat], Highlights]:
+        """Sightings near the mirror direction, by a coat of weight 0 over them.
 
         Args:
             material: [N, 4] at the samples. noise: of a pixel, in display values.
@@ -98,8 +98,8 @@ class Within:
         shiny = self.samples.sin2 < DIFFUSE_SIN2
         shiny &= torch.from_numpy(self.vertex % max(1, int(shiny.sum()) // HIGHLIGHT_PIXELS) == 0)
 
-        def under(roughness: float) -> Highlights:
-            seen = self.sightings(material, replace(shared, coat=Coat(0.0, roughness)), shiny, noise)
+        def under(coat: Coat) -> Highlights:
+            seen = self.sightings(material, replace(shared, coat=coat), shiny, noise)
             return Highlights(seen.vertex, seen.residual, seen.slopes[:, F0], seen.by_coat)
 
         return under

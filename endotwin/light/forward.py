@@ -53,12 +53,12 @@ class Lobes:
     Attributes:
         f0: reflectance of the specular lobe at normal incidence; 0: there is none.
         burley: whether the diffuse lobe is Burley's, rather than Lambert's.
-        coat: weight and roughness of a coat; None: there is none.
+        coat: weight, roughness and tail of a coat; None: there is none.
     """
 
     f0: float
     burley: bool = True
-    coat: tuple[float, float] | None = None
+    coat: tuple[float, float, float] | None = None
 
 
 @dataclass(frozen=True)
@@ -102,8 +102,8 @@ def shares(lit: Lit, log_light: LogLight, roughness: Tensor, lobes: Lobes) -> li
         if lobes.f0 > 0:
             shine = strength * lobes.f0 * shading.specular_lobe(cos_i, lit.cos_o, sin2_m, roughness)
         if lobes.coat is not None:
-            wet = torch.full_like(roughness, lobes.coat[1])
-            coat = strength * shading.F0_WATER * shading.specular_lobe(cos_i, lit.cos_o, sin2_m, wet)
+            lobe = shading.coat_lobe(cos_i, lit.cos_o, sin2_m, *lobes.coat[1:])
+            coat = strength * shading.F0_WATER * lobe
         found.append(Share(per_color, shine, coat, log_axis, log_distance))
     return found
 

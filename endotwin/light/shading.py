@@ -80,6 +80,18 @@ def ggx(sin2_m: Tensor, alpha: Tensor) -> Tensor:
     return alpha2 / (math.pi * (sin2_m + alpha2 * (1 - sin2_m)) ** 2)
 
 
+def gtr(sin2_m: Tensor, alpha: Tensor, tail: float) -> Tensor:
+    """Generalised Trowbridge–Reitz distribution D(wm) [N] ∝ (s² + α²c²)^−tail (Burley 2012, appendix B.2), of
+    integral ∫D·(n·wm) = 1: GGX for a tail of 2, Berry's for 1, whose haze reaches far from the peak.
+
+    Its constant (tail − 1)(1 − α²)/(π(α^{2−2·tail} − 1)) is written so that it has its limit at 1.
+    """
+    log_width = -2 * torch.log(alpha).clamp_max(-1e-9)
+    stretch = ((tail - 1) * log_width).clamp_min(1e-9)
+    norm = -torch.expm1(-log_width) / log_width * (stretch / torch.expm1(stretch))
+    return norm / (math.pi * (sin2_m + alpha * alpha * (1 - sin2_m)) ** tail)
+
+
 def smith_visibility(cos_i: Tensor, cos_o: Tensor, alpha: Tensor) -> Tensor:
     """G / (4 cos_i cos_o) [N] with Smith's separable G for GGX (Walter et al. 2007, eq. 34), cancelled:
     bounded by 1/(4α²).
@@ -106,6 +118,13 @@ def specular_lobe(cos_i: Tensor, cos_o: Tensor, sin2_m: Tensor, roughness: Tenso
     at 10° between them."""
     alpha = roughness.clamp_min(ROUGHNESS_MIN) ** 2
     return ggx(sin2_m, alpha) * smith_visibility(cos_i, cos_o, alpha)
+
+
+def coat_lobe(cos_i: Tensor, cos_o: Tensor, sin2_m: Tensor, roughness: float, tail: float) -> Tensor:
+    """The white lobe of a coat, [N], per unit of its reflectance: as ``specular_lobe``, with the haze of its
+    tail."""
+    alpha = sin2_m.new_tensor(max(roughness, ROUGHNESS_MIN) ** 2)
+    return gtr(sin2_m, alpha, tail) * smith_visibility(cos_i, cos_o, alpha)
 
 
 def specular_colocated(cos: Tensor, sin2: Tensor, roughness: Tensor) -> Tensor:

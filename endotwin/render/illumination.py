@@ -151,8 +151,7 @@ def _log_light(twin: Twin) -> tuple[float, float, float]:
 
 def _lobes(twin: Twin) -> Lobes:
     coat = twin.effects.get("coat")
-    wet = None if coat is None else (coat.weight, coat.roughness)
-    return Lobes(twin.materials.f0, twin.materials.diffuse == "burley", wet)
+    return Lobes(twin.materials.f0, twin.materials.diffuse == "burley", coat and coat.lobe)
 
 
 def _albedo(twin: Twin, radiosity: Radiosity) -> np.ndarray:
