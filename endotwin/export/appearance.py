@@ -33,7 +33,8 @@ class Appearance:
             together they have L0.
         gamma: display value = x^gamma.
         f0: specular reflectance at normal incidence. burley: whether the diffuse lobe is Burley's.
-        coat_f0, coat_roughness: reflectance, times its weight, and roughness of the wet coat; 0: no coat.
+        coat_f0, coat_roughness, coat_tail: reflectance, times its weight, roughness and tail of the wet coat;
+            a reflectance of 0: no coat.
         vignetting_k2, vignetting_k4: transmission exp(k2·r² + k4·r⁴) of the lens.
         bounce: strength of light that other tissue throws.
         usual_mm: the distance from which tissue is usually seen.
@@ -49,6 +50,7 @@ class Appearance:
     burley: bool
     coat_f0: float
     coat_roughness: float
+    coat_tail: float
     vignetting_k2: float
     vignetting_k4: float
     bounce: float
@@ -70,6 +72,7 @@ class Appearance:
             burley=twin.materials.diffuse == "burley",
             coat_f0=coat.weight * shading.F0_WATER if coat else 0.0,
             coat_roughness=coat.roughness if coat else 0.0,
+            coat_tail=coat.tail if coat else 2.0,
             vignetting_k2=lens.k2 if lens else 0.0,
             vignetting_k4=lens.k4 if lens else 0.0,
             bounce=effects.bounce,

@@ -6,7 +6,8 @@ in float rough;
 out vec4 shown;
 
 const float PI = 3.14159265358979, COS_MIN = 1e-4, ROUGHNESS_MIN = 0.045, RADIANCE_MIN = 1e-6;
-uniform float L0, n, q, profile, gamma, f0, burley, coat_f0, coat_roughness, roughness, exposure;
+uniform float L0, n, q, profile, gamma, f0, burley, roughness, exposure;
+uniform float coat_f0, coat_roughness, coat_tail;
 uniform vec2 vignetting;   // k2, k4
 uniform vec4 image;        // fx, fy, cx, cy in px
 uniform vec2 size;         // width and height, px
@@ -15,19 +16,20 @@ uniform int guides;
 
 float pow5(float x) { return x * x * x * x * x; }
 
-float ggx(float sin2_m, float alpha) {
-  float a2 = alpha * alpha, s = sin2_m + a2 * (1.0 - sin2_m);
-  return a2 / (PI * s * s);
+float gtr(float sin2_m, float alpha, float tail) {
+  float a2 = min(alpha * alpha, 0.9999), log_width = -log(a2), stretch = (tail - 1.0) * log_width;
+  float norm = (1.0 - a2) / log_width * (stretch < 1e-3 ? 1.0 : stretch / (exp(stretch) - 1.0));
+  return norm / (PI * pow(sin2_m + a2 * (1.0 - sin2_m), tail));
 }
 
 float half_smith(float cosine, float alpha) {
   return cosine + sqrt(alpha * alpha * (1.0 - cosine * cosine) + cosine * cosine);
 }
 
-float lobe(float cos_i, float cos_o, float sin2_m, float r) {
+float lobe(float cos_i, float cos_o, float sin2_m, float r, float tail) {
   float alpha = max(r, ROUGHNESS_MIN);
   alpha *= alpha;
-  return ggx(sin2_m, alpha) / (half_smith(cos_i, alpha) * half_smith(cos_o, alpha));
+  return gtr(sin2_m, alpha, tail) / (half_smith(cos_i, alpha) * half_smith(cos_o, alpha));
 }
 
 float diffuse(float cos_i, float cos_o, float cos_d, float r) {
@@ -47,7 +49,8 @@ vec3 radiance(vec3 facing, float r) {
     float strength = exp(log(L0) + n * log_axis - q * log(distance_mm)) * cos_i * 2.0 * PI / float(guides);
     float sin2_m = dot(across, across);
     x += strength / PI * mix(1.0, diffuse(cos_i, cos_o, cos_d, r), burley) * base;
-    x += strength * (f0 * lobe(cos_i, cos_o, sin2_m, r) + coat_f0 * lobe(cos_i, cos_o, sin2_m, coat_roughness));
+    x += strength * f0 * lobe(cos_i, cos_o, sin2_m, r, 2.0);
+    x += strength * coat_f0 * lobe(cos_i, cos_o, sin2_m, coat_roughness, coat_tail);
   }
   return x;
 }

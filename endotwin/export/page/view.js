@@ -131,6 +131,7 @@ function draw() {
   set1("gamma", look.gamma);
   set1("burley", look.burley ? 1 : 0);
   set1("coat_roughness", look.coat_roughness || 0.12);
+  set1("coat_tail", look.coat_tail);
   gl.drawElements(gl.TRIANGLES, count, gl.UNSIGNED_INT, 0);
 }
 
