@@ -20,6 +20,8 @@ from endotwin.synth.encodings import FLOW_RANGE_PX
 from endotwin.synth.job import Job
 from endotwin.synth.labels import DEFAULT_LABELS, LABELS
 from endotwin.synth.layouts import LAYOUTS
+from endotwin.synth.proof import Proof, Written, prove
+from endotwin.synth.proof.written import read_records
 from endotwin.synth.run import crew
 from endotwin.synth.run.datasheet import write_datasheet
 from endotwin.synth.run.partial import Partial
@@ -31,6 +33,9 @@ from endotwin.twin import Twin
 
 WORTH_PROCESSES = 2e7
 """Pixels, of all frames, below which starting processes takes longer than it saves: 65 VGA frames."""
+
+PROOF_PAIRS = 2
+"""Pairs of frames whose labels are compared for the datasheet; ``endotwin check --labels`` takes more."""
 
 EXTREME = 0.95
 """Share of black or saturated pixels from which a dataset shows nothing."""
@@ -195,11 +200,19 @@ def _finish(job: Job, partial: Partial) -> None:
         points = surface.vertices_mm.astype("float64") + surface.origin_mm
         trimesh.Trimesh(points, surface.triangles, process=False).export(folder / "surface.ply")
     document = {**job.document, "coverage": statistics.mean_coverage()}
-    write_datasheet(folder / "datasheet.html", document, statistics)
+    write_datasheet(folder / "datasheet.html", document, statistics, _proof(folder, document))
     document["files"] = sorted({*partial.kinds(), DATASET})
     text = json.dumps(document, indent=1, ensure_ascii=False) + "\n"
     (folder / DATASET).write_text(text, encoding="utf-8", errors="backslashreplace")
     partial.finish()
+
+
+def _proof(folder: Path, document: dict) -> Proof:
+    """What some frames prove of the labels; a warning where they do not agree."""
+    proof = prove(Written(folder, document, read_records(folder)), PROOF_PAIRS)
+    if not proof.holds:
+        logger.warning("the labels do not agree: it is not so that %s", "; or that ".join(proof.broken))
+    return proof
 
 
 def _doubt_exposure(brightness: np.ndarray) -> None:
