@@ -12,7 +12,7 @@ from command_line import invoke
 
 from endotwin.errors import SequenceError
 from endotwin.sequence.images import read_color
-from endotwin.synth import LABELS, LAYOUTS, Trajectory, prove, synthesize
+from endotwin.synth import LAYOUTS, Trajectory, parse_labels, prove, synthesize
 from endotwin.synth.encodings import ENCODINGS
 from endotwin.synth.proof import CLAIMS, Written
 
@@ -30,7 +30,7 @@ def rendered(folder: Path, **options) -> Path:
     """A dataset of a tube with folds that hide each other."""
     twin = tube_twin.fitted(tube_twin.seen(tube_twin.surface(fold_mm=3.0)))
     trajectory = Trajectory(poses(), np.arange(FRAMES) / 30, "three poses")
-    options = {"labels": tuple(LABELS), "camera": tube_twin.CAMERA.scaled(2)} | options
+    options = {"labels": parse_labels("all"), "camera": tube_twin.CAMERA.scaled(2)} | options
     synthesize(twin, trajectory, folder, **options)
     return folder
 
@@ -48,7 +48,7 @@ def test_every_claim_holds_of_every_layout(layout, tmp_path):
     assert all(row.pixels > 100 for row in proof.rows)
 
 
-@pytest.mark.parametrize("label", LABELS)
+@pytest.mark.parametrize("label", parse_labels("all"))
 def test_a_label_alone_proves_what_it_can_and_breaks_nothing(label, tmp_path):
     proof = prove(rendered(tmp_path / "d", labels=(label,)))
     assert proof.holds, proof.broken

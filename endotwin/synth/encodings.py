@@ -342,4 +342,21 @@ ENCODINGS: dict[str, Encoding] = {
         "32-bit signed: index of the triangle in surface.ply, counted from 0; -1: none",
         lambda content: tifffile.imread(BytesIO(content)),
     ),
+    **{
+        name: Encoding(
+            ".exr",
+            lambda moved_mm: exr(X=plane(moved_mm, 0), Y=plane(moved_mm, 1), Z=plane(moved_mm, 2)),
+            f"OpenEXR, channels X, Y, Z, 32-bit float: the tissue's own motion {way}, mm, along the world's "
+            "axes (the camera's is in the poses); NaN: none (no surface, or no such frame)",
+            lambda content: channels(content, "X", "Y", "Z"),
+        )
+        for name, way in (("scene_flow", _BACK), ("scene_flow_forward", _ON))
+    },
+    "vertices": Encoding(
+        ".npz",
+        lambda vertices_mm: npz(vertices_mm=vertices_mm.astype(np.float32)),
+        "NumPy, array vertices_mm [V, 3], 32-bit float: the vertices of surface.ply (which has them at rest) "
+        "in this frame, world, mm",
+        lambda content: np.load(BytesIO(content))["vertices_mm"].astype(np.float64),
+    ),
 }

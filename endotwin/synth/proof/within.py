@@ -39,7 +39,8 @@ def within(frame: Frame) -> Iterator[Judged]:
     yield from _codes(frame)
     if frame.written.has("normals") and frame.distance_mm is not None:
         yield "normals", _normals(frame)
-    if frame.written.has("triangles") and frame.distance_mm is not None and not frame.written.moving:
+    placed = not frame.written.moving or frame.written.has("vertices")
+    if frame.written.has("triangles") and frame.distance_mm is not None and placed:
         yield "triangles", _triangles(frame)
     yield from _colors(frame)
 
@@ -81,6 +82,8 @@ def _places(frame: Frame) -> Iterator[Judged]:
         exists = 0 <= other < len(frame.written)
         for image in filter(has, FLOWS[name]):
             wrong |= np.isfinite(frame.image(image)).all(axis=-1) & ~(there & exists)
+        if has(f"scene_{name}"):
+            wrong |= np.isfinite(frame.image(f"scene_{name}")).all(axis=-1) != (there & exists)
         if has(f"{name}_hidden"):
             wrong |= (frame.image(f"{name}_hidden") == 128) == (there & exists)
     yield "places", wrong.ravel().astype(float)
@@ -131,7 +134,10 @@ def _triangles(frame: Frame) -> np.ndarray:
     chosen = np.flatnonzero(np.isfinite(frame.distance_mm) & (frame.image("triangles") >= 0))
     rays = frame.written.rays.reshape(-1, 3)[chosen] @ frame.T_world_camera[:3, :3].T
     points = frame.T_world_camera[:3, 3] + rays * frame.distance_mm.ravel()[chosen, None]
-    a, b, c = frame.written.triangles_mm[frame.image("triangles").ravel()[chosen]].transpose(1, 0, 2)
+    vertices_mm, triangles = frame.written.surface
+    if frame.written.moving:
+        vertices_mm = frame.image("vertices")
+    a, b, c = vertices_mm[triangles[frame.image("triangles").ravel()[chosen]]].transpose(1, 0, 2)
     facing = unit(np.cross(b - a, c - a))
     off = np.abs(dot(points - a, facing)) - frame.half_step_mm(chosen) * np.abs(dot(rays, facing))
     return np.maximum(off, 0)

@@ -92,7 +92,7 @@ class Written:
             raise SequenceError(
                 f"{self.folder / place} is missing, or holds no {name}; render the dataset again"
             ) from error
-        if image.shape[:2] != (self.camera.height, self.camera.width):
+        if name != "vertices" and image.shape[:2] != (self.camera.height, self.camera.width):
             raise SequenceError(f"{self.folder / place} has the shape {image.shape[:2]}, unlike its camera")
         return image
 
@@ -103,10 +103,10 @@ class Written:
         return self.camera.directions(np.stack([u, v], axis=-1).astype(np.float64))
 
     @cached_property
-    def triangles_mm(self) -> np.ndarray:
-        """Corners float64 [F, 3, 3] of the triangles of ``surface.ply``, world."""
+    def surface(self) -> tuple[np.ndarray, np.ndarray]:
+        """Vertices float64 [V, 3], world, mm, and triangles [F, 3] of ``surface.ply``."""
         mesh = trimesh.load(self.folder / "surface.ply", process=False)
-        return np.asarray(mesh.vertices, np.float64)[np.asarray(mesh.faces)]
+        return np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces)
 
     def _packed(self, index: int, place: str) -> bytes:
         """The file ``place`` of a frame, out of its tar; the tar read last stays open."""

@@ -36,6 +36,7 @@ def write_datasheet(path: Path, document: dict, statistics: Statistics, proof: P
         _table("Poses", document["poses"]),
         _table("Limits of the poses", document["limits"]),
         _table("Variation", _flat(document["variation"])),
+        _table("Motion", _flat(document.get("motion", {}))),
         _table("Twin", _flat(document["twin"])),
         _table("Camera", document["camera"]),
         _table("Conventions", document["conventions"]),
