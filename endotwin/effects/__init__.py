@@ -14,7 +14,10 @@ from endotwin.effects.effect import STATES, Decision, Effect
 from endotwin.errors import OptionError
 
 FITTED = ("specular", "offset", "shadows", "interreflection", "gain", "vignetting", "profile", "coat", "film")
-RENDERED = ("noise", "motion_blur", "defocus", "rolling_shutter", "chromatic", "bloom", "lens")
+RENDERED = (
+    *("noise", "motion_blur", "defocus", "rolling_shutter", "chromatic", "bloom", "lens"),
+    *("processor", "codec"),
+)
 NAMES = (*FITTED, *RENDERED)
 
 __all__ = [

@@ -9,6 +9,7 @@ import numpy as np
 
 from endotwin.effects import RENDERED
 from endotwin.surface.vectors import dot, unit
+from endotwin.synth.photograph import RECORDING
 from endotwin.synth.proof.warp import DEPTHS, Frame
 
 Judged = tuple[str, np.ndarray]
@@ -157,7 +158,12 @@ def _colors(frame: Frame) -> Iterator[Judged]:
         clear = np.abs(least - 0.1) > HIGHLIGHT_MARGIN
         yield "places", ((least > 0.1) != (frame.image("highlights") > 0))[clear].astype(float)
     linear = frame.first("rgb_exr", "rgb_linear")
-    if linear is not None and has("rgb") and "noise" not in rendered and not record.get("response"):
+    if (
+        linear is not None
+        and has("rgb")
+        and not rendered & {"noise", *RECORDING}
+        and not record.get("response")
+    ):
         gamma = frame.written.document["twin"]["response"]["gamma"]
         lit = (linear > 1e-3) & (linear < 1)
         yield "response", 255 * np.abs(np.clip(linear, 0, 1) ** gamma - frame.image("rgb"))[lit]
