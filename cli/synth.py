@@ -69,7 +69,8 @@ def synth(
         str,
         typer.Option(
             metavar="NAME=STATE,…",
-            help="Effects on or off, as in noise=on,shadows=off; as the twin has them unless named.",
+            help="Effects on or off, as in noise=on,shadows=off; as the twin has them unless named. "
+            "like=SEQUENCE: with the noise and the lens that its photos show.",
             show_default=False,
         ),
     ] = "",
@@ -136,7 +137,12 @@ def synth(
             twin = Twin.load(twin_folder)
         limits = Limits(clearance, max_unseen, float("inf") if max_distance is None else max_distance)
         choices = {"material": material or (), "light": light or (), "vary": vary, "camera": camera}
-        choices |= {"effects": parse_states(effects), "limits": limits, "seed": seed, "overwrite": overwrite}
+        choices |= {
+            "effects": parse_states(effects, like=True),
+            "limits": limits,
+            "seed": seed,
+            "overwrite": overwrite,
+        }
         choices["motion"] = motion or ()
         with run.stage("synth"):
             if preview:

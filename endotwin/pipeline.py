@@ -196,7 +196,8 @@ def synthesize(
         material: one edit such as ``roughness*1.3``, or several. light: such as ``intensity*0.8``.
         vary: YAML file of ranges that edits are drawn from (see ``endotwin.synth.read_variation``).
         camera: a ``camera.json`` to render through; the twin's own camera unless given.
-        effects: on or off by name; noise and lens get the strength that is measured in the twin's sequence.
+        effects: on or off by name; noise and lens get the strength that is measured in the twin's sequence,
+            or in that whose path stands under the name ``like``.
         motion: of the tissue, such as ``peristalsis:amplitude=1`` or ``breathing``, one or several (see
             ``endotwin.synth.parse_motion``).
         labels: names such as ``rgb,depth`` (see ``endotwin.synth.LABELS``), or ``all``.

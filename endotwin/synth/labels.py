@@ -169,6 +169,7 @@ class _Geometry:
     ):
         self._job, self._body, self._hits, self._index = job, body, hits, index
         self._caster = body.at(index)
+        self._others: dict[int, np.ndarray] = {}
         self._kinds, self._renderer, self._view = kinds, renderer, view
         self._T_world_camera = job.trajectory.T_world_camera[index]
 
@@ -248,7 +249,11 @@ class _Geometry:
     def _points_at(self, index: int) -> np.ndarray:
         """Where the points of the hits are in another frame, world, float64 [N, 3]."""
         surface = self._body.at(index).surface
-        return self._points if surface is self._caster.surface else surface_points(surface, self._hits)
+        if surface is self._caster.surface:
+            return self._points
+        if index not in self._others:
+            self._others[index] = surface_points(surface, self._hits)
+        return self._others[index]
 
     @property
     def scene_flow(self) -> np.ndarray:
