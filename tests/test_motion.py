@@ -193,15 +193,24 @@ def test_the_camera_rides_on_the_swaying_lumen_and_keeps_its_clearance(plain):
     np.testing.assert_allclose(carried.checks["clearance_mm"], tube_twin.RADIUS_MM, atol=0.3)
 
 
-def test_the_same_motion_gives_the_same_bytes_in_any_number_of_processes(twin, tmp_path):
+def test_the_same_motion_gives_the_same_bytes_in_any_number_of_processes_and_after_a_stop(twin, tmp_path):
     job = job_of(twin, [WAVES], "rgb,depth,flow_npz,scene_flow,vertices")
     job = replace(job, shard_frames=1)
     for name, workers in (("one", 1), ("two", 2)):
         endotwin.synth.render_dataset(job, tmp_path / name, workers=workers)
+
+    def stop(label: str, done: int, total: int) -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        endotwin.synth.render_dataset(job, tmp_path / "three", progress=stop)
+    assert not (tmp_path / "three").exists() and (tmp_path / "three.partial").exists()
+    endotwin.synth.render_dataset(job, tmp_path / "three")
     files = sorted(file.name for file in (tmp_path / "one").iterdir())
-    assert files == sorted(file.name for file in (tmp_path / "two").iterdir())
-    for name in files:
-        assert (tmp_path / "one" / name).read_bytes() == (tmp_path / "two" / name).read_bytes(), name
+    for other in ("two", "three"):
+        assert files == sorted(file.name for file in (tmp_path / other).iterdir())
+        for name in files:
+            assert (tmp_path / "one" / name).read_bytes() == (tmp_path / other / name).read_bytes(), name
 
 
 def test_a_dataset_of_still_tissue_says_nothing_of_motion(twin, tmp_path):

@@ -30,7 +30,7 @@ POSITIVE = ("width", "speed", "delay", "spacing", "period", "wavelength")
 NARROWEST = 0.2
 """Least share of its radius that a contraction may leave of the lumen."""
 
-PROBES = 24
+PROBES = 8
 """Times at which the surface is searched for folds; at the worst of them, for triangles that cross."""
 
 FLAWS, MORE = 1e-4, 1.1
