@@ -33,10 +33,8 @@ CLAIMS = {
         "a label in several codes holds the same numbers", "half steps", 1.1, 1e-5, "the codes' ends"
     ),
     "flow": Claim("flow is what depth, poses and the tissue's motion give", "px", 0.05, 1e-4, "rounding"),
-    "cycle": Claim(
-        "flow there and back ends where it began, if both frames see it", "px", 0.1, 0.005, "rims"
-    ),
-    "warp": Claim("depth, moved into the other frame, is its depth", "% of it", 0.1, 0.005, "rims"),
+    "cycle": Claim("flow there and back ends where it began, if both frames see it", "px", 0.1, 0.02, "rims"),
+    "warp": Claim("depth, moved into the other frame, is its depth", "% of it", 0.1, 0.02, "rims"),
     "hidden": Claim("hidden is what lies behind what is seen there", "pixels", 0.0, 0.02, "rims"),
     "occlusion": Claim("occlusion tells of what another frame sees behind", "pixels", 0.0, 0.005, "rims"),
     "normals": Claim("normals are the gradient of depth, over 17 pixels", "°", 0.5, 0.25, "coarse folds"),
