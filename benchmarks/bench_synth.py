@@ -10,7 +10,7 @@ from pathlib import Path
 
 import psutil
 
-from endotwin.synth import DEFAULT_LABELS, parse_labels, parse_trajectory, synthesize
+from endotwin.synth import DEFAULT_LABELS, parse_labels, parse_motion, parse_trajectory, synthesize
 from endotwin.twin import Twin
 
 PAPER_FRAMES = 18_000
@@ -23,13 +23,18 @@ def main() -> None:
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--labels", default=",".join(DEFAULT_LABELS))
     parser.add_argument("--layout", default="c3vd")
+    parser.add_argument("--trajectory", default="jitter", help="its kind")
+    parser.add_argument("--motion", action="append", default=[], help="of the tissue, as synth takes it")
     parser.add_argument(
         "--folder", type=Path, help="where to write; the system's temporary folder unless given"
     )
     arguments = parser.parse_args()
     twin = Twin.load(arguments.twin)
     started = time.perf_counter()
-    trajectory = parse_trajectory(f"jitter:frames={arguments.frames}", twin, seed=0)
+    trajectory = parse_trajectory(f"{arguments.trajectory}:frames={arguments.frames}", twin, seed=0)
+    motion = parse_motion(arguments.motion, twin)
+    if motion:
+        trajectory = motion.carried(trajectory)
     drawn_s = time.perf_counter() - started
     memory_mb, first = [], []
 
@@ -43,7 +48,8 @@ def main() -> None:
             twin,
             trajectory,
             Path(folder) / "dataset",
-            labels=parse_labels(arguments.labels),
+            labels=parse_labels(arguments.labels, motion is not None),
+            motion=motion,
             layout=arguments.layout,
             workers=arguments.workers,
             progress=progress,

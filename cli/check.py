@@ -1,4 +1,4 @@
-"""``endotwin check``: whether poses, intrinsics, depth and photos agree."""
+"""``endotwin check``: whether poses, intrinsics, depth and photos agree, or the labels of a dataset."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from endotwin.cli import console
 
 if TYPE_CHECKING:
     from endotwin.check import Report
+    from endotwin.synth import Proof
 
 
 def check(
@@ -26,6 +27,12 @@ def check(
         str | None,
         typer.Option(metavar="NAME", help="c3vd, transforms, simcol or tum.", show_default="detected"),
     ] = None,
+    labels: Annotated[
+        bool,
+        typer.Option(
+            "--labels", help="Prove that the labels of a dataset from 'endotwin synth' agree with each other."
+        ),
+    ] = False,
     json: Annotated[
         bool, typer.Option("--json", help="Print the findings as JSON instead of a table.")
     ] = False,
@@ -34,20 +41,40 @@ def check(
     """Tell whether a SEQUENCE's poses, intrinsics, depth unit and photos agree, and if not, what to change.
 
     Frames are warped onto each other through depth, as written and under the usual mistakes. Exit code 0: all
-    agrees; 1: there is something to mend; 2: the sequence cannot be read.
+    agrees; 1: there is something to mend; 2: the sequence cannot be read. With --labels: flow against depth
+    and poses, normals against the gradient of depth, depth against the next frame's, and so on.
 
     Example: endotwin check examples/colon_small
     """
     with console.command("check", profile) as run:
         with run.stage("import"):
             from endotwin.check import check
+            from endotwin.synth import prove
         with run.stage("check"):
-            report = check(sequence, format, run.progress)
+            found = (
+                prove(sequence, progress=run.progress) if labels else check(sequence, format, run.progress)
+            )
     if json:
-        print(json_format.dumps(report.to_dict()))
+        print(json_format.dumps(found.to_dict()))
     else:
-        _show(report)
-    raise typer.Exit(0 if report.consistent else 1)
+        (_show_proof if labels else _show)(found)
+    raise typer.Exit(0 if (found.holds if labels else found.consistent) else 1)
+
+
+def _show_proof(proof: Proof) -> None:
+    """A row a claim, and the verdict."""
+    from rich.console import Console
+    from rich.table import Table
+
+    from endotwin.synth.proof.claims import HEADINGS
+
+    out = Console(highlight=False)
+    if proof.rows:
+        table = Table(*HEADINGS, box=None, pad_edge=False)
+        for row in proof.rows:
+            table.add_row(*row.cells())
+        out.print(table)
+    out.print(f"[bold]{proof.verdict}[/]", soft_wrap=True)
 
 
 def _show(report: Report) -> None:

@@ -15,7 +15,7 @@ from endotwin.run.output import DATASET, check_apart, check_free, check_picture
 LABELS = (
     "rgb, rgb_linear, rgb_exr, depth, depth_exr, normals, mask, albedo, roughness, metallic, diffuse, "
     "specular, flow, flow_forward, flow_exr, flow_npz, flow_forward_exr, flow_forward_npz, occlusion, "
-    "triangles; 'all'"
+    "triangles; of motion scene_flow, scene_flow_forward, vertices; 'all'"
 )
 
 
@@ -69,10 +69,19 @@ def synth(
         str,
         typer.Option(
             metavar="NAME=STATE,…",
-            help="Effects on or off, as in noise=on,shadows=off; as the twin has them unless named.",
+            help="Effects on or off, as in noise=on,shadows=off; as the twin has them unless named. "
+            "like=SEQUENCE: with the noise and the lens that its photos show.",
             show_default=False,
         ),
     ] = "",
+    motion: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="KIND:…",
+            help="Let the tissue move: 'peristalsis:amplitude=…,width=…,speed=…,delay=…,pulse=…' or "
+            "'breathing:amplitude=…,period=…,follow=…'; may be repeated.",
+        ),
+    ] = None,
     clearance: Annotated[
         float, typer.Option(metavar="MM", help="Least distance of a pose from the wall.")
     ] = 1.0,
@@ -128,7 +137,13 @@ def synth(
             twin = Twin.load(twin_folder)
         limits = Limits(clearance, max_unseen, float("inf") if max_distance is None else max_distance)
         choices = {"material": material or (), "light": light or (), "vary": vary, "camera": camera}
-        choices |= {"effects": parse_states(effects), "limits": limits, "seed": seed, "overwrite": overwrite}
+        choices |= {
+            "effects": parse_states(effects, like=True),
+            "limits": limits,
+            "seed": seed,
+            "overwrite": overwrite,
+        }
+        choices["motion"] = motion or ()
         with run.stage("synth"):
             if preview:
                 summary = pipeline.preview(twin, trajectory, preview, **choices)

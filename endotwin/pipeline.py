@@ -176,6 +176,7 @@ def synthesize(
     vary: Path | str | None = None,
     camera: Path | str | None = None,
     effects: Mapping[str, str] | None = None,
+    motion: Iterable[str] | str = (),
     labels: Iterable[str] | str | None = None,
     layout: str = "c3vd",
     limits: Limits | None = None,
@@ -195,7 +196,10 @@ def synthesize(
         material: one edit such as ``roughness*1.3``, or several. light: such as ``intensity*0.8``.
         vary: YAML file of ranges that edits are drawn from (see ``endotwin.synth.read_variation``).
         camera: a ``camera.json`` to render through; the twin's own camera unless given.
-        effects: on or off by name; noise and lens get the strength that is measured in the twin's sequence.
+        effects: on or off by name; noise and lens get the strength that is measured in the twin's sequence,
+            or in that whose path stands under the name ``like``.
+        motion: of the tissue, such as ``peristalsis:amplitude=1`` or ``breathing``, one or several (see
+            ``endotwin.synth.parse_motion``).
         labels: names such as ``rgb,depth`` (see ``endotwin.synth.LABELS``), or ``all``.
         layout: one of ``endotwin.synth.LAYOUTS``.
         limits: what a pose must keep to be rendered.
@@ -212,7 +216,7 @@ def synthesize(
     """
     from endotwin.synth import render_dataset
 
-    job = _job(twin, trajectory, material, light, vary, camera, effects, labels, layout, limits, seed)
+    job = _job(twin, trajectory, material, light, vary, camera, effects, motion, labels, layout, limits, seed)
     return render_dataset(job, out, workers, scheduler, overwrite, progress)
 
 
@@ -226,6 +230,7 @@ def preview(
     vary: Path | str | None = None,
     camera: Path | str | None = None,
     effects: Mapping[str, str] | None = None,
+    motion: Iterable[str] | str = (),
     limits: Limits | None = None,
     seed: int = 0,
     overwrite: bool = False,
@@ -237,7 +242,7 @@ def preview(
     """
     from endotwin.look import preview as draw
 
-    job = _job(twin, trajectory, material, light, vary, camera, effects, "rgb", "c3vd", limits, seed)
+    job = _job(twin, trajectory, material, light, vary, camera, effects, motion, "rgb", "c3vd", limits, seed)
     return draw.preview(job, out, overwrite)
 
 
@@ -249,6 +254,7 @@ def _job(
     vary: Path | str | None,
     camera: Path | str | None,
     effects: Mapping[str, str] | None,
+    motion: Iterable[str] | str,
     labels: Iterable[str] | str | None,
     layout: str,
     limits: Limits | None,
@@ -266,9 +272,12 @@ def _job(
         variation = synth.read_variation(Path(vary), twin, variation)
     chosen = synth.DEFAULT_LABELS
     if labels is not None:
-        chosen = synth.parse_labels(labels if isinstance(labels, str) else ",".join(labels))
+        chosen = synth.parse_labels(labels if isinstance(labels, str) else ",".join(labels), bool(motion))
     poses = synth.parse_trajectory(trajectory, twin, seed, lens, limits)
-    return synth.make_job(twin, poses, seed, chosen, layout, lens, variation)
+    moving = synth.parse_motion(motion, twin)
+    if moving:
+        poses = moving.carried(poses)
+    return synth.make_job(twin, poses, seed, chosen, layout, lens, variation, moving)
 
 
 def _check_positive(name: str, value: float) -> None:

@@ -251,9 +251,9 @@ def test_a_normal_of_none_is_0_and_the_unit_vectors_read_back():
 def test_all_labels_are_written_and_explained(folded, tmp_path):
     twin, poses = folded
     trajectory = Trajectory(poses, np.arange(3) / 30, "poses")
-    synthesize(twin, trajectory, tmp_path / "d", labels=tuple(LABELS), layout="c3vd2")
-    for name, image_names in LABELS.items():
-        for image in image_names:
+    synthesize(twin, trajectory, tmp_path / "d", labels=parse_labels("all"), layout="c3vd2")
+    for name in parse_labels("all"):
+        for image in LABELS[name]:
             folder = {"flow": "optical_flow", "occlusion": "occlusions"}.get(image, image)
             assert len(list((tmp_path / "d" / folder).iterdir())) == 3, name
     ids = tifffile.imread(tmp_path / "d" / "triangles" / "0001.tiff")

@@ -16,6 +16,7 @@ from endotwin.cli.main import main
 from endotwin.sequence.poses import write_c3vd_poses
 from endotwin.sequence.readers import open_sequence
 from endotwin.synth import DEFAULT_LABELS, LABELS, LAYOUTS
+from endotwin.synth.motion.kinds import KINDS
 
 FRAMES = 40
 
@@ -103,6 +104,10 @@ def test_progress_shows_frames_a_second():
         (["-o", "{new}", "--effects", "noise=auto"], "noise=on or off"),
         (["-o", "{new}", "--max-distance", "5"], "nowhere"),
         (["-o", "{new}", "--workers", "-1"], "workers"),
+        (["-o", "{new}", "--motion", "swallowing"], "peristalsis or breathing"),
+        (["-o", "{new}", "--motion", "breathing:period=0"], "period"),
+        (["-o", "{new}", "--labels", "scene_flow"], "--motion"),
+        (["-o", "{new}", "--effects", "like=nowhere"], "nowhere"),
         (["--preview", "{new}.jpg"], "png"),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",
@@ -119,6 +124,7 @@ def test_options_that_make_no_sense_are_refused_in_one_line_and_nothing_is_left(
 def test_the_help_names_all_labels_and_layouts():
     options = command.synth.__annotations__
     assert all(label in command.LABELS for label in LABELS)
+    assert all(kind in str(options["motion"]) for kind in KINDS)
     assert all(layout in str(options["layout"]) for layout in LAYOUTS)
     assert command.synth.__kwdefaults__ is None
     assert ",".join(DEFAULT_LABELS) in [str(value) for value in command.synth.__defaults__]

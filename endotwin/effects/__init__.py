@@ -14,7 +14,10 @@ from endotwin.effects.effect import STATES, Decision, Effect
 from endotwin.errors import OptionError
 
 FITTED = ("specular", "offset", "shadows", "interreflection", "gain", "vignetting", "profile", "coat", "film")
-RENDERED = ("noise", "motion_blur", "defocus", "rolling_shutter", "chromatic", "bloom", "lens")
+RENDERED = (
+    *("noise", "motion_blur", "defocus", "rolling_shutter", "chromatic", "bloom", "lens"),
+    *("processor", "codec"),
+)
 NAMES = (*FITTED, *RENDERED)
 
 __all__ = [
@@ -90,8 +93,8 @@ def effect_class(name: str) -> type[Effect]:
     return getattr(module, name.title().replace("_", ""))
 
 
-def parse_states(text: str) -> dict[str, str]:
-    """``shadows=off,gain=on`` as states by name.
+def parse_states(text: str, like: bool = False) -> dict[str, str]:
+    """``shadows=off,gain=on`` as states by name; with ``like``, ``like=SEQUENCE`` too.
 
     Raises:
         OptionError: an unknown effect or state.
@@ -99,6 +102,9 @@ def parse_states(text: str) -> dict[str, str]:
     states = {}
     for entry in filter(None, (part.strip() for part in text.split(","))):
         name, _, state = entry.partition("=")
+        if like and name == "like" and state:
+            states[name] = state
+            continue
         if name not in NAMES or state not in STATES:
             raise OptionError(
                 f"'{entry}' is no choice of an effect; write NAME=auto, on or off with a NAME of "

@@ -7,7 +7,8 @@ on its way in this order:
 - how tissue answers it (specular, coat);
 - when pixels see it (motion blur, rolling shutter);
 - what the lens makes of the radiance image (vignetting, defocus, chromatic, bloom, lens);
-- what the sensor makes of that (gain, noise).
+- what the sensor makes of that (gain, noise);
+- what becomes of the picture afterwards (processor, codec).
 """
 
 from __future__ import annotations

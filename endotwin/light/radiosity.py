@@ -13,6 +13,7 @@ and UNSEEN_INDIRECT of the indirect one.
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -96,12 +97,25 @@ class Radiosity:
         self.form_factors = self._counted(corners, normal, rays, generator)
         met = np.asarray(self.form_factors.sum(axis=1)).ravel()
         self.unseen = ((1 - met) / np.maximum(met, LEAST_SEEN)).astype(np.float32)
-        triangle = self._draw(POINTS, generator)
-        self._points_mm = _inside(corners[triangle], generator)
-        self._normals = normal[triangle]
+        self._drawn = self._draw(POINTS, generator)
+        self._weights = _weights(len(self._drawn), generator)
+        self._points_mm = _mixed(self._weights, corners[self._drawn])
+        self._normals = normal[self._drawn]
         self.centre_mm = self._mean_of_points(self._points_mm)
         self._facing = unit(self._mean_of_points(self._normals))
         self._surface = surface
+
+    def moved(self, caster: Caster) -> Radiosity:
+        """The same patches on the moved surface of ``caster``, which has the same triangles: lit where they
+        are now, and still with the form factors of this surface."""
+        other = copy(self)
+        vars(other)["to_vertex"] = self.to_vertex
+        other._surface, other._caster = caster.surface, caster
+        corners = caster.surface.vertices_mm[caster.surface.triangles[self._drawn]]
+        other._points_mm = _mixed(self._weights, corners)
+        other._normals = unit(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
+        other.centre_mm = other._mean_of_points(other._points_mm)
+        return other
 
     @cached_property
     def to_vertex(self) -> scipy.sparse.csr_array:
@@ -235,9 +249,18 @@ def _patches(centre_mm: np.ndarray, normal: np.ndarray, cell_mm: float) -> np.nd
 
 
 def _inside(corners: np.ndarray, generator: np.random.Generator) -> np.ndarray:
-    """One point drawn evenly inside each triangle [N, 3, 3], float32 [N, 3] (Turk 1990)."""
-    root, second = np.sqrt(generator.random(len(corners))), generator.random(len(corners))
-    weights = np.stack([1 - root, root * (1 - second), root * second], axis=1)
+    """One point drawn evenly inside each triangle [N, 3, 3], float32 [N, 3]."""
+    return _mixed(_weights(len(corners), generator), corners)
+
+
+def _weights(count: int, generator: np.random.Generator) -> np.ndarray:
+    """Barycentric weights [count, 3] of points drawn evenly inside triangles (Turk 1990)."""
+    root, second = np.sqrt(generator.random(count)), generator.random(count)
+    return np.stack([1 - root, root * (1 - second), root * second], axis=1)
+
+
+def _mixed(weights: np.ndarray, corners: np.ndarray) -> np.ndarray:
+    """Points float32 [N, 3] of barycentric ``weights`` [N, 3] in triangles [N, 3, 3]."""
     return np.einsum("nk,nka->na", weights, corners).astype(np.float32)
 
 

@@ -4,6 +4,7 @@ light."""
 from __future__ import annotations
 
 import math
+from copy import copy
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -43,6 +44,15 @@ class Illumination:
                 self._albedo = before._albedo
             if self._albedo is None:
                 self._albedo = _albedo(twin, self._radiosity)
+
+    def moved(self, twin: Twin, caster: Caster) -> Illumination:
+        """That of ``twin`` on the moved surface of ``caster``, which has the same triangles. Tissue throws
+        light on tissue by the form factors of the surface at rest."""
+        other = copy(self)
+        other.twin, other._caster = twin, caster
+        if self._radiosity is not None:
+            other._radiosity = self._radiosity.moved(caster)
+        return other
 
     @property
     def nbytes(self) -> int:

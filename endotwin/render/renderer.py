@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from copy import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -21,7 +21,7 @@ from endotwin.run.threads import THREADS
 from endotwin.sequence.poses import as_poses
 from endotwin.surface.casting import Caster, Correspondences
 from endotwin.surface.silhouettes import discontinuities
-from endotwin.surface.vectors import dot
+from endotwin.surface.vectors import dot, turned_along
 from endotwin.twin import Twin, as_twin
 
 SUBPIXELS = 2
@@ -129,6 +129,21 @@ class Renderer:
         if twin.materials is not self.twin.materials:
             other._normal_and_material = _normal_and_material(twin)
         vars(other).pop("_transmission", None)
+        return other
+
+    def moved(self, caster: Caster) -> Renderer:
+        """The renderer of the same twin on the moved surface of ``caster``, which has the same triangles."""
+        other = copy(self)
+        rest, surface, materials = self.twin.surface, caster.surface, self.twin.materials
+        if materials.film is not None:
+            at = materials.film.vertex
+            normal = turned_along(materials.film.normal, rest.normals[at], surface.normals[at])
+            materials = replace(materials, film=replace(materials.film, normal=normal))
+        other.twin, other.caster = replace(self.twin, surface=surface, materials=materials), caster
+        other._illumination = self._illumination.moved(other.twin, caster)
+        other._normal_and_material = np.concatenate(
+            [surface.normals, self._normal_and_material[:, 3:]], axis=1
+        )
         return other
 
     def through(self, camera: Camera) -> Renderer:

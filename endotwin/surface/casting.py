@@ -71,7 +71,7 @@ class Caster:
         self.surface = surface
         self._threads = threads
         self._scene = rtcore_scene.EmbreeScene(robust=True)
-        self._mesh = TriangleMesh(self._scene, surface.vertices_mm[surface.triangles])
+        self._mesh = TriangleMesh(self._scene, surface.vertices_mm, surface.triangles)
 
     def threaded(self, threads: int) -> Caster:
         """The same scene, cast into by so many threads."""

@@ -14,3 +14,11 @@ def unit(vectors: np.ndarray) -> np.ndarray:
     """Vectors [..., 3] scaled to unit length; a zero vector stays zero."""
     norm = np.sqrt(dot(vectors, vectors))[..., None]
     return vectors / np.maximum(norm, np.finfo(vectors.dtype).tiny)
+
+
+def turned_along(vectors: np.ndarray, one: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """Vectors [N, 3] turned as unit vectors ``one`` [N, 3] turn the least way to ``other`` [N, 3], which they
+    are not opposite to (Rodrigues)."""
+    axis = np.cross(one, other)
+    across = np.cross(axis, vectors)
+    return vectors + across + np.cross(axis, across) / (1 + dot(one, other))[:, None]

@@ -3,6 +3,8 @@
 from endotwin.synth.job import Job
 from endotwin.synth.labels import DEFAULT_LABELS, LABELS, parse_labels
 from endotwin.synth.layouts import LAYOUTS
+from endotwin.synth.motion import Motion, parse_motion
+from endotwin.synth.proof import Proof, prove
 from endotwin.synth.run.dataset import Summary, make_job, render_dataset, synthesize
 from endotwin.synth.trajectories import Trajectory, parse_trajectory
 from endotwin.synth.trajectories.screening import Limits
@@ -17,6 +19,8 @@ __all__ = [
     "Edit",
     "Job",
     "Limits",
+    "Motion",
+    "Proof",
     "Summary",
     "Trajectory",
     "Variation",
@@ -26,7 +30,9 @@ __all__ = [
     "parse_labels",
     "parse_light_edit",
     "parse_material_edit",
+    "parse_motion",
     "parse_trajectory",
+    "prove",
     "read_variation",
     "render_dataset",
     "synthesize",

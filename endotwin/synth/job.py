@@ -10,6 +10,7 @@ from importlib.metadata import version
 import numpy as np
 
 from endotwin.cameras import Camera
+from endotwin.synth.motion import Motion
 from endotwin.synth.trajectories import Trajectory
 from endotwin.synth.variation import Draw
 from endotwin.synth.variation.regions import Region
@@ -29,7 +30,7 @@ class Job:
         trajectory: a pose a frame. draws: edits of the twin, one a frame. regions: that the draws refer to.
         labels: names of labels. images: names of the images that they are written as. layout: its name.
         shard_frames: frames that are rendered, and counted as done, together.
-        document: the content of ``dataset.json``.
+        document: the content of ``dataset.json``. motion: of the tissue; None: it is still.
     """
 
     twin: Twin
@@ -42,6 +43,7 @@ class Job:
     layout: str
     shard_frames: int
     document: dict
+    motion: Motion | None = None
 
     def __len__(self) -> int:
         return len(self.trajectory)

@@ -14,9 +14,10 @@ from endotwin.render import Renderer, View
 from endotwin.render.renderer import laid_out
 from endotwin.run.streams import Stream
 from endotwin.surface import Surface
-from endotwin.surface.casting import Caster, Correspondences, surface_points
+from endotwin.surface.casting import Correspondences, surface_points
 from endotwin.synth.flow import flow_to, hides_surface, seen_from
 from endotwin.synth.job import Job
+from endotwin.synth.motion import Body
 from endotwin.synth.photograph import photographed
 
 MASK_NONE, MASK_FILLED, MASK_UNSEEN, MASK_VALID = 0, 64, 128, 255
@@ -43,8 +44,14 @@ LABELS: dict[str, tuple[str, ...]] = {
     "flow_forward_npz": ("flow_forward_npz", "flow_forward_hidden"),
     "occlusion": ("occlusion",),
     "triangles": ("triangles",),
+    "scene_flow": ("scene_flow",),
+    "scene_flow_forward": ("scene_flow_forward",),
+    "vertices": ("vertices",),
 }
 """Labels that may be asked for, and the images that each one is written as."""
+
+OF_MOTION = ("scene_flow", "scene_flow_forward", "vertices")
+"""Labels that only tissue which moves by itself has."""
 
 DEFAULT_LABELS = ("rgb", "depth", "normals", "mask")
 
@@ -60,11 +67,14 @@ SHADED = PHOTOS | SPLIT | {"albedo", "roughness", "metallic"}
 """Labels that need a photo, those of its parts, and all that need the frame's draw."""
 
 
-def parse_labels(text: str) -> tuple[str, ...]:
-    """Names of labels from ``rgb,depth,…`` or ``all``, in their own order; raises OptionError."""
+def parse_labels(text: str, moving: bool = False) -> tuple[str, ...]:
+    """Names of labels from ``rgb,depth,…`` or ``all``, in their own order; raises OptionError.
+
+    ``all`` is those that tissue has which is ``moving`` by itself, or is not.
+    """
     names = [name.strip() for name in text.split(",") if name.strip()]
     if names == ["all"]:
-        return tuple(LABELS)
+        return tuple(name for name in LABELS if moving or name not in OF_MOTION)
     unknown = [name for name in names if name not in LABELS]
     if unknown or not names:
         raise OptionError(
@@ -83,11 +93,11 @@ def triangle_kinds(surface: Surface) -> np.ndarray:
 
 
 class Labeller:
-    """Labels the frames of a job; keeps one ray caster, and the renderer of the latest draw."""
+    """Labels the frames of a job; keeps rays of the latest frames, and the renderer of the latest draw."""
 
     def __init__(self, job: Job):
         self._job = job
-        self._caster = Caster(job.twin.surface, threads=1)
+        self._body = Body(job.twin.surface, job.motion, job.trajectory.timestamps_s)
         self._kinds = triangle_kinds(job.twin.surface)
         self._T_world_next = following(job.trajectory.T_world_camera)
         self._shaded: tuple[object, Renderer, Renderer | None] | None = None
@@ -115,8 +125,8 @@ class Labeller:
                 images["specular"] = view.color - matt.color
                 images["highlights"] = np.uint8(255 * (images["specular"].min(axis=2) > HIGHLIGHT))
             view = view or matt
-        hits = view.hits if view else self._caster.cast(job.camera, T_world_camera)
-        geometry = _Geometry(job, self._caster, hits, index, self._kinds, renderer, view)
+        hits = view.hits if view else self._body.at(index).cast(job.camera, T_world_camera)
+        geometry = _Geometry(job, self._body, hits, index, self._kinds, renderer, view)
         for name in job.images:
             if name not in images:
                 images[name] = getattr(geometry, name)
@@ -129,7 +139,7 @@ class Labeller:
         if kept is None or kept[0] != draw:
             twin, exposure = draw.edited(self._job.twin, self._job.regions)
             if kept is None:
-                renderer = Renderer(twin, self._job.camera, caster=self._caster, exposure=exposure)
+                renderer = Renderer(twin, self._job.camera, caster=self._body.at_rest, exposure=exposure)
             else:
                 renderer = kept[1].edited(twin, exposure)
             specular_free = None
@@ -138,7 +148,10 @@ class Labeller:
                 matt = replace(twin, materials=matt, effects=twin.effects.without(MIRRORS))
                 specular_free = renderer.edited(matt, exposure)
             kept = self._shaded = (draw, renderer, specular_free)
-        return kept[1:]
+        if not self._body.moves:
+            return kept[1:]
+        caster = self._body.at(index)
+        return tuple(None if renderer is None else renderer.moved(caster) for renderer in kept[1:])
 
 
 class _Geometry:
@@ -147,14 +160,16 @@ class _Geometry:
     def __init__(
         self,
         job: Job,
-        caster: Caster,
+        body: Body,
         hits: Correspondences,
         index: int,
         kinds: np.ndarray,
         renderer: Renderer | None,
         view: View | None,
     ):
-        self._job, self._caster, self._hits, self._index = job, caster, hits, index
+        self._job, self._body, self._hits, self._index = job, body, hits, index
+        self._caster = body.at(index)
+        self._others: dict[int, np.ndarray] = {}
         self._kinds, self._renderer, self._view = kinds, renderer, view
         self._T_world_camera = job.trajectory.T_world_camera[index]
 
@@ -180,7 +195,7 @@ class _Geometry:
     def normals(self) -> np.ndarray:
         if self._view:
             return self._view.normals
-        surface = self._job.twin.surface
+        surface = self._caster.surface
         return self._image(to_camera(self._hits.interpolate(surface, surface.normals), self._T_world_camera))
 
     @property
@@ -229,7 +244,34 @@ class _Geometry:
 
     @cached_property
     def _points(self) -> np.ndarray:
-        return surface_points(self._job.twin.surface, self._hits)
+        return surface_points(self._caster.surface, self._hits)
+
+    def _points_at(self, index: int) -> np.ndarray:
+        """Where the points of the hits are in another frame, world, float64 [N, 3]."""
+        surface = self._body.at(index).surface
+        if surface is self._caster.surface:
+            return self._points
+        if index not in self._others:
+            self._others[index] = surface_points(surface, self._hits)
+        return self._others[index]
+
+    @property
+    def scene_flow(self) -> np.ndarray:
+        return self._scene_flow(self._index - 1)
+
+    @property
+    def scene_flow_forward(self) -> np.ndarray:
+        return self._scene_flow(self._index + 1)
+
+    @property
+    def vertices(self) -> np.ndarray:
+        surface = self._caster.surface
+        return surface.vertices_mm + surface.origin_mm
+
+    def _scene_flow(self, index: int) -> np.ndarray:
+        if self._other(index) is None:
+            return self._image(np.full((len(self._hits), 3), np.nan), np.nan)
+        return self._image(self._points_at(index) - self._points, np.nan)
 
     def _other(self, index: int) -> np.ndarray | None:
         """The pose of another frame; None where there is none."""
@@ -240,11 +282,13 @@ class _Geometry:
         T_world_other = self._other(index)
         if T_world_other is None:
             return self._image(np.full((len(self._hits), 2), np.nan), np.nan)
-        return self._image(flow_to(self._points, self._hits.pixel, self._job.camera, T_world_other), np.nan)
+        points = self._points_at(index)
+        return self._image(flow_to(points, self._hits.pixel, self._job.camera, T_world_other), np.nan)
 
     def _hidden(self, index: int) -> np.ndarray:
         T_world_other = self._other(index)
         if T_world_other is None:
             return self._image(np.full(len(self._hits), HIDDEN_NONE, np.uint8), HIDDEN_NONE)
-        seen = seen_from(self._points, self._caster, self._job.camera, T_world_other)
+        there = self._body.at(index)
+        seen = seen_from(self._points_at(index), there, self._job.camera, T_world_other)
         return self._image(np.where(seen, np.uint8(HIDDEN_NO), np.uint8(HIDDEN_YES)), HIDDEN_NONE)

@@ -1,4 +1,6 @@
-"""From a rendered view to the photo that a camera would have taken of it: exposure, optics, sensor."""
+"""From a rendered view to the photo that a camera would have taken of it: exposure, optics, sensor,
+processor, recorder.
+"""
 
 from __future__ import annotations
 
@@ -13,6 +15,9 @@ from endotwin.render import Renderer, View
 EXPOSURE = ("motion_blur", "rolling_shutter")
 OPTICS = ("defocus", "chromatic", "bloom", "lens")
 """In the order in which light meets them."""
+
+RECORDING = ("processor", "codec")
+"""In the order in which the picture meets them."""
 
 
 def photographed(
@@ -42,4 +47,7 @@ def photographed(
     color = shading.respond(radiance, renderer.twin.response.gamma).clamp(0, 1).numpy()
     if "noise" in effects:
         color = effects["noise"].read(color, generator)
+    for name in RECORDING:
+        if name in effects:
+            color = effects[name].recorded(color)
     return color, radiance.numpy()

@@ -18,8 +18,11 @@ from endotwin.run.output import DATASET, check_apart, unwritable
 from endotwin.run.threads import cores
 from endotwin.synth.encodings import FLOW_RANGE_PX
 from endotwin.synth.job import Job
-from endotwin.synth.labels import DEFAULT_LABELS, LABELS
+from endotwin.synth.labels import DEFAULT_LABELS, LABELS, OF_MOTION
 from endotwin.synth.layouts import LAYOUTS
+from endotwin.synth.motion import Motion
+from endotwin.synth.proof import Proof, Written, prove
+from endotwin.synth.proof.written import read_records
 from endotwin.synth.run import crew
 from endotwin.synth.run.datasheet import write_datasheet
 from endotwin.synth.run.partial import Partial
@@ -31,6 +34,9 @@ from endotwin.twin import Twin
 
 WORTH_PROCESSES = 2e7
 """Pixels, of all frames, below which starting processes takes longer than it saves: 65 VGA frames."""
+
+PROOF_PAIRS = 2
+"""Pairs of frames whose labels are compared for the datasheet; ``endotwin check --labels`` takes more."""
 
 EXTREME = 0.95
 """Share of black or saturated pixels from which a dataset shows nothing."""
@@ -71,6 +77,7 @@ def synthesize(
     layout: str = "c3vd",
     camera: Camera | None = None,
     variation: Variation | None = None,
+    motion: Motion | None = None,
     workers: int = 1,
     scheduler: str | None = None,
     overwrite: bool = False,
@@ -86,6 +93,7 @@ def synthesize(
         seed: of what ``variation`` draws; kept in ``dataset.json``.
         labels: names among ``LABELS``. layout: a name among ``LAYOUTS``.
         camera: to render through; the twin's own unless given.
+        motion: of the tissue, on whose moving lumen the trajectory was ``carried``; still unless given.
         workers: processes; 1 renders in this one. 0: as many as there are cores, where it is worth it.
         scheduler: address of a Dask scheduler to render on, such as ``tcp://host:8786``.
         progress: called with (label, done, total).
@@ -94,7 +102,8 @@ def synthesize(
         TwinError: the twin is not fitted. OptionError: a layout does not fit the camera or the labels.
         OutputError: ``out`` exists, another job is unfinished there, or it cannot be written.
     """
-    job = make_job(twin, trajectory, seed, labels, layout, camera or twin.camera, variation or Variation())
+    camera, variation = camera or twin.camera, variation or Variation()
+    job = make_job(twin, trajectory, seed, labels, layout, camera, variation, motion)
     return render_dataset(job, out, workers, scheduler, overwrite, progress)
 
 
@@ -125,12 +134,16 @@ def make_job(
     layout: str,
     camera: Camera,
     variation: Variation,
+    motion: Motion | None = None,
 ) -> Job:
     """The job of ``synthesize``'s arguments; raises TwinError or OptionError where they do not fit."""
     if not twin.fitted:
         raise TwinError("the twin has no materials yet; run 'endotwin fit' on it first")
     if layout not in LAYOUTS:
         raise OptionError(f"there is no layout {layout!r}; choose one of {', '.join(LAYOUTS)}")
+    still = [label for label in labels if motion is None and label in OF_MOTION]
+    if still:
+        raise OptionError(f"the label {still[0]} needs tissue that moves; ask for motion too (--motion)")
     refusal = LAYOUTS[layout].refusal(camera, labels)
     if refusal:
         raise OptionError(f"layout {layout}: {refusal}")
@@ -144,7 +157,8 @@ def make_job(
         images=tuple(dict.fromkeys(image for label in labels for image in LABELS[label])),
         layout=layout,
         shard_frames=LAYOUTS[layout].shard_frames,
-        document=describe(twin, trajectory, seed, labels, layout, camera, variation),
+        document=describe(twin, trajectory, seed, labels, layout, camera, variation, motion),
+        motion=motion,
     )
 
 
@@ -190,16 +204,24 @@ def _finish(job: Job, partial: Partial) -> None:
     with (folder / "frames.jsonl").open("w", encoding="utf-8") as file:
         for index in range(len(job)):
             file.write(json.dumps(frame_record(job, index)) + "\n")
-    if "triangles" in job.labels:
+    if {"triangles", "vertices"} & set(job.labels):
         surface = job.twin.surface
         points = surface.vertices_mm.astype("float64") + surface.origin_mm
         trimesh.Trimesh(points, surface.triangles, process=False).export(folder / "surface.ply")
     document = {**job.document, "coverage": statistics.mean_coverage()}
-    write_datasheet(folder / "datasheet.html", document, statistics)
+    write_datasheet(folder / "datasheet.html", document, statistics, _proof(folder, document))
     document["files"] = sorted({*partial.kinds(), DATASET})
     text = json.dumps(document, indent=1, ensure_ascii=False) + "\n"
     (folder / DATASET).write_text(text, encoding="utf-8", errors="backslashreplace")
     partial.finish()
+
+
+def _proof(folder: Path, document: dict) -> Proof:
+    """What some frames prove of the labels; a warning where they do not agree."""
+    proof = prove(Written(folder, document, read_records(folder)), PROOF_PAIRS)
+    if not proof.holds:
+        logger.warning("the labels do not agree: it is not so that %s", "; or that ".join(proof.broken))
+    return proof
 
 
 def _doubt_exposure(brightness: np.ndarray) -> None:

@@ -7,6 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
+from endotwin.synth.proof import Proof
+from endotwin.synth.proof.claims import HEADINGS
 from endotwin.synth.run.statistics import BRIGHTNESS_BINS, COVERAGE, DEPTH_BINS_MM, Statistics
 
 STYLE = (
@@ -21,7 +23,7 @@ WIDTH, HEIGHT = 340, 150
 COLUMNS = 340
 
 
-def write_datasheet(path: Path, document: dict, statistics: Statistics) -> None:
+def write_datasheet(path: Path, document: dict, statistics: Statistics, proof: Proof) -> None:
     """Write the page for a dataset of this ``dataset.json``; the same content gives the same bytes."""
     sections = [
         f"<h1>{document['frames']} frames of {escape(document['twin']['sequence'])}, {document['format']} "
@@ -30,9 +32,11 @@ def write_datasheet(path: Path, document: dict, statistics: Statistics) -> None:
         f"{document['seed']}.</p>",
         _pictures(statistics),
         f'<div class="charts">{_charts(statistics)}</div>',
+        _proven(proof),
         _table("Poses", document["poses"]),
         _table("Limits of the poses", document["limits"]),
         _table("Variation", _flat(document["variation"])),
+        _table("Motion", _flat(document.get("motion", {}))),
         _table("Twin", _flat(document["twin"])),
         _table("Camera", document["camera"]),
         _table("Conventions", document["conventions"]),
@@ -106,6 +110,17 @@ def _figure(title: str, drawing: str, caption: str) -> str:
         f'<figure><h2>{title}</h2><svg viewBox="0 0 {WIDTH} {HEIGHT}" width="{WIDTH}" height="{HEIGHT}">'
         f"{drawing}</svg>"
         f"<figcaption>{caption}</figcaption></figure>"
+    )
+
+
+def _proven(proof: Proof) -> str:
+    """The table of what labels claim of each other, and whether it holds."""
+    rows = [HEADINGS, *(row.cells() for row in proof.rows)]
+    cells = ("".join(f"<td>{escape(cell)}</td>" for cell in row) for row in rows)
+    table = "".join(f"<tr>{row}</tr>" for row in cells) if proof.rows else ""
+    return (
+        f"<h2>Consistency</h2><p>{escape(proof.verdict)} 'endotwin check DATASET --labels' compares more.</p>"
+        f"<table>{table}</table>"
     )
 
 

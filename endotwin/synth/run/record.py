@@ -10,6 +10,7 @@ from endotwin.cameras import Camera
 from endotwin.synth.job import fingerprint, versions
 from endotwin.synth.labels import LABELS
 from endotwin.synth.layouts import LAYOUTS
+from endotwin.synth.motion import Motion
 from endotwin.synth.trajectories import Trajectory
 from endotwin.synth.variation import Variation
 from endotwin.twin import Twin
@@ -38,9 +39,11 @@ def describe(
     layout: str,
     camera: Camera,
     variation: Variation,
+    motion: Motion | None = None,
 ) -> dict:
     """All of ``dataset.json`` that is known before the first frame is rendered."""
     chosen = LAYOUTS[layout]
+    moving = {} if motion is None else {"motion": motion.to_dict()}
     words = {image: chosen.encoding(image).words for label in labels for image in LABELS[label]}
     return {
         "format": layout,
@@ -57,6 +60,7 @@ def describe(
             "seed": seed,
         },
         "variation": variation.to_dict(),
+        **moving,
         "camera": camera.to_dict(),
         "twin": {
             "sha256": fingerprint(twin),

@@ -19,6 +19,8 @@ COVERAGE = {"valid": 255, "unseen": 128, "filled": 64, "none": 0}
 STRIDE = 4
 """Depth and brightness are counted at every so many pixels, across and down."""
 
+SPARSE = ("depth", "rgb", "mask")
+
 THUMBNAIL_PX = 200
 THUMBNAIL_QUALITY = 80
 
@@ -43,7 +45,7 @@ class Statistics:
 
     def add(self, images: dict[str, np.ndarray], thumbnail_of: int | None = None) -> None:
         """Count a frame's images; keep its picture as that of frame ``thumbnail_of`` if given."""
-        sparse = {name: image[::STRIDE, ::STRIDE] for name, image in images.items()}
+        sparse = {name: image[::STRIDE, ::STRIDE] for name, image in images.items() if name in SPARSE}
         if "depth" in images:
             self.depth += _counts(sparse["depth"], DEPTH_BINS_MM)
         if "rgb" in images:
@@ -108,7 +110,7 @@ def thumbnail(images: dict[str, np.ndarray]) -> bytes:
             picture = encode_color(images[name])
             break
     else:
-        name, image = next(iter(images.items()))
+        image = next((image for name, image in images.items() if name != "vertices"), np.zeros((1, 1)))
         values = np.nan_to_num(image if image.ndim == 2 else image[..., 0]).astype(np.float32)
         picture = encode_color((values - values.min()) / max(float(np.ptp(values)), 1e-9))
     height, width = picture.shape[:2]

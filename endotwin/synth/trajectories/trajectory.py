@@ -11,7 +11,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from endotwin.cameras import Camera
-from endotwin.errors import TrajectoryError
+from endotwin.errors import EndotwinError, TrajectoryError
 from endotwin.run.streams import Stream
 from endotwin.sequence.poses import as_poses, frame_times, read_poses
 from endotwin.synth.trajectories.flight import FlightOptions, fly
@@ -110,7 +110,7 @@ def parse_trajectory(
             raise TrajectoryError(
                 f"trajectory {spec!r}: there is no file {name!r} of keyframes; give its name"
             )
-    options = _parse_options(spec, text, KINDS[kind])
+    options = parse_options(spec, text, KINDS[kind])
     if kind == "jitter":
         return _jittered(spec, options, twin, gate, seed)
     if kind == "centerline":
@@ -142,15 +142,25 @@ MOST_FRAMES = 100_000
 """Poses are kept in memory; more frames are made as several datasets, each with a seed of its own."""
 
 
-def _parse_options(spec: str, text: str, options: type):
-    """``KEY=VALUE,…`` as an instance of the dataclass ``options``; values at least 0 unless ``signed``."""
+def parse_options(
+    spec: str,
+    text: str,
+    options: type,
+    what: str = "trajectory",
+    error: type[EndotwinError] = TrajectoryError,
+):
+    """``KEY=VALUE,…`` as an instance of the dataclass ``options``; values at least 0 unless ``signed``.
+
+    Raises:
+        error: ``text``, a part of the ``spec`` of ``what``, is not understood.
+    """
     known = {f.name: f for f in fields(options)}
     values: dict[str, float] = {}
     for item in filter(None, (part.strip() for part in text.split(","))):
         key, equals, value = (part.strip() for part in item.partition("="))
         if not equals or key not in known or key in values:
-            raise TrajectoryError(
-                f"trajectory {spec!r}: {item!r} is not understood; write KEY=VALUE, each KEY once, "
+            raise error(
+                f"{what} {spec!r}: {item!r} is not understood; write KEY=VALUE, each KEY once, "
                 f"out of {', '.join(known)}"
             )
         try:
@@ -160,8 +170,8 @@ def _parse_options(spec: str, text: str, options: type):
         least = -GREATEST if known[key].metadata.get("signed") else 0
         most = MOST_FRAMES if key == "frames" else GREATEST
         if not least <= values[key] <= most:
-            raise TrajectoryError(
-                f"trajectory {spec!r}: {value!r} is no value for {key} ({known[key].metadata['help']}), "
+            raise error(
+                f"{what} {spec!r}: {value!r} is no value for {key} ({known[key].metadata['help']}), "
                 f"which lies between {least:g} and {most:g}"
             )
     return options(**values)

@@ -12,6 +12,7 @@ from endotwin.effects.offset import Offset
 from endotwin.effects.shadows import Shadows
 from endotwin.errors import OptionError
 from endotwin.light.guides import AT_LENS
+from endotwin.sequence.readers import open_sequence
 from endotwin.synth.variation.edits import OFFSETS, Edit
 from endotwin.twin import Twin
 
@@ -36,16 +37,26 @@ def switched(effects: Effects, switches: Iterable[tuple[str, bool]]) -> Effects:
 def equipped(twin: Twin, states: Mapping[str, str], trajectory: object) -> Twin:
     """The twin with effects on or off as ``states`` say, as strong as its sequence shows them to be.
 
+    Under the name ``like`` stands the path of another sequence, whose strengths are taken instead; what its
+    photos show is on unless a state says otherwise.
+
     Raises:
         OptionError: an effect that only a fit can turn on or decide, or blur of a trajectory without a
-            velocity.
+            velocity. SequenceError: there is no such sequence.
     """
+    states = dict(states)
+    like = states.pop("like", None)
+    sequence = None if like is None else open_sequence(like)
     undecided = [name for name, state in states.items() if state == "auto"]
     if undecided:
         raise OptionError(
             f"{undecided[0]}=auto is for 'endotwin fit', which decides; write {undecided[0]}=on or off here"
         )
     effects = twin.effects.without([name for name, state in states.items() if state == "off"])
+    if sequence is not None:
+        shown = (effect_class(name).evidence(sequence)[0] for name in RENDERED if name not in states)
+        for effect in filter(None, shown):
+            effects = effects.including(effect)
     for name, state in states.items():
         if state != "on" or name in effects:
             continue
@@ -53,7 +64,7 @@ def equipped(twin: Twin, states: Mapping[str, str], trajectory: object) -> Twin:
             raise OptionError(f"the twin has no {name}; a fit with its effect {name} on finds it")
         if name in NEED_VELOCITY and str(trajectory).startswith("jitter"):
             raise OptionError(f"{name} needs poses that follow each other, and those of jitter do not")
-        found = effect_class(name).evidence(twin.sequence())[0] if name in RENDERED else None
+        found = effect_class(name).evidence(sequence or twin.sequence())[0] if name in RENDERED else None
         effects = effects.including(found or effect_class(name)())
     return replace(twin, effects=effects)
 

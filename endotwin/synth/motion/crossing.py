@@ -1,0 +1,27 @@
+"""Triangles of a surface that cross each other: edges that pass through a triangle they do not touch."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from endotwin.surface import Surface
+from endotwin.surface.casting import Caster
+from endotwin.surface.vectors import unit
+
+ENDS = 1e-3
+"""Share of an edge at its ends that is not judged: there it meets its own triangles."""
+
+
+def crossings(surface: Surface) -> np.ndarray:
+    """Numbers, ascending, of triangles that an edge of another passes through, int [K]."""
+    pairs = np.sort(surface.triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+    edges = np.unique(pairs, axis=0)
+    start, end = (surface.vertices_mm[edges[:, k]] for k in range(2))
+    towards = end - start
+    length_mm = np.linalg.norm(towards, axis=1)
+    long = length_mm > 0
+    edges, start, towards, length_mm = edges[long], start[long], towards[long], length_mm[long]
+    hit, _, distance_mm = Caster(surface).cast_rays(start + ENDS * towards, unit(towards))
+    met = np.flatnonzero((hit >= 0) & (distance_mm < (1 - 2 * ENDS) * length_mm))
+    touching = (surface.triangles[hit[met]][:, :, None] == edges[met][:, None, :]).any(axis=(1, 2))
+    return np.unique(hit[met[~touching]])

@@ -1,0 +1,54 @@
+"""A proof: pairs of frames, spread over the dataset, and all that their labels claim of each other."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from endotwin.synth.proof.between import between
+from endotwin.synth.proof.claims import Proof, Tally
+from endotwin.synth.proof.warp import Frame
+from endotwin.synth.proof.within import within
+from endotwin.synth.proof.written import Written
+
+PAIRS = 50
+"""Pairs of frames that are judged, where a dataset has more."""
+
+
+def prove(
+    dataset: Written | Path | str, pairs: int = PAIRS, progress: Callable[[str, int, int], None] | None = None
+) -> Proof:
+    """Judge the labels of a dataset by its files alone.
+
+    Args:
+        dataset: its folder. pairs: of frames that follow each other, spread evenly; all where there are
+            fewer. progress: called with (label, done, total).
+
+    Raises:
+        SequenceError: there is no dataset, or a file of it is missing or damaged.
+    """
+    written = dataset if isinstance(dataset, Written) else Written.open(dataset)
+    firsts = _spread(max(len(written) - 1, 1), pairs)
+    tally, kept = Tally(), Frame(written, int(firsts[0]))
+    try:
+        for done, first in enumerate(firsts, 1):
+            one = kept if kept.index == first else Frame(written, int(first))
+            if one is not kept or done == 1:
+                tally.add(within(one))
+            if first + 1 < len(written):
+                kept = Frame(written, int(first) + 1)
+                tally.add(within(kept))
+                tally.add(between(one, kept))
+                tally.add(between(kept, one))
+            if progress:
+                progress("prove", done, len(firsts))
+    finally:
+        written.close()
+    return tally.proof(len(written), len(firsts))
+
+
+def _spread(count: int, most: int) -> np.ndarray:
+    """At most ``most`` numbers below ``count``, even."""
+    return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(int))

@@ -1,0 +1,64 @@
+"""The recorder: what JPEG keeps, what it loses, and that labels know nothing of it."""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import tube_twin
+
+import endotwin
+import endotwin.synth
+from endotwin.effects import Effects
+from endotwin.effects.codec import Codec
+from endotwin.effects.processor import Processor
+
+LABELS = "rgb,rgb_linear,depth,normals,mask,diffuse"
+
+
+def picture() -> np.ndarray:
+    """Smooth shading with fine texture."""
+    v, u = np.meshgrid(np.arange(96.0), np.arange(128.0), indexing="ij")
+    shade = 0.5 + 0.3 * np.sin(u / 17) * np.cos(v / 13)
+    grain = 0.08 * np.random.default_rng(0).standard_normal((96, 128))
+    return np.clip(np.stack([shade + grain, 0.6 * shade + grain, 0.4 * shade + grain], axis=2), 0, 1).astype(
+        np.float32
+    )
+
+
+def test_more_quality_is_less_error_and_the_highest_is_near_rounding():
+    image = picture()
+    errors = [np.sqrt(np.mean((Codec(q).recorded(image) - image) ** 2)) for q in (10, 40, 70, 95)]
+    assert np.all(np.diff(errors) < 0) and errors[0] > 3 * errors[3]
+    even = np.full((64, 64, 3), (0.6, 0.4, 0.3), np.float32)
+    assert np.abs(Codec(100).recorded(even) - even).max() < 2.5 / 255
+
+
+def test_colour_is_kept_at_half_the_size_and_brightness_at_all_of_it():
+    """Columns that alternate in colour alone are averaged; columns that alternate in brightness are not."""
+    gray = np.full((64, 64, 3), 0.5, np.float32)
+    bright, colored = gray.copy(), gray.copy()
+    bright[:, ::2] += 0.2
+    colored[:, ::2] += np.array([0.2, -0.2 * 0.299 / 0.587, 0], np.float32)
+    kept = [np.ptp(Codec(100).recorded(image)[32, 20:40, 0]) for image in (bright, colored)]
+    assert kept[0] > 0.18 and kept[1] < 0.05
+
+
+def test_blocks_of_8_pixels_show_at_low_quality():
+    found = Codec(5).recorded(picture())[..., 1]
+    steps = np.abs(np.diff(found, axis=1)).mean(axis=0)
+    at_edges = np.arange(127) % 8 == 7
+    assert steps[at_edges].mean() > 2 * steps[~at_edges].mean()
+
+
+def test_rgb_alone_is_recorded(tmp_path):
+    twin = tube_twin.fitted(tube_twin.seen(tube_twin.surface()))
+    poses = np.stack([tube_twin.pose(s) for s in (0.5, 0.52)])
+    for name, effects in (("plain", []), ("recorded", [Processor(), Codec()])):
+        equipped = replace(twin, effects=Effects(effects))
+        endotwin.synthesize(equipped, poses, tmp_path / name, labels=LABELS)
+    for file in (tmp_path / "plain").glob("0001_*"):
+        same = file.read_bytes() == (tmp_path / "recorded" / file.name).read_bytes()
+        assert same == (file.name != "0001_color.png"), file.name
+    one, other = (cv2.imread(str(tmp_path / name / "0001_color.png")) for name in ("plain", "recorded"))
+    assert 1 < np.abs(one.astype(float) - other).mean() < 40
+    assert endotwin.synth.prove(tmp_path / "recorded").holds

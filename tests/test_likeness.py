@@ -1,0 +1,62 @@
+"""Effects as strong as another recording shows them."""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+import tube_sequence
+import tube_twin
+
+import endotwin
+from endotwin.effects import Effects, parse_states
+from endotwin.effects.noise import Noise
+from endotwin.errors import OptionError, SequenceError
+from endotwin.synth import equipped
+
+SIGMA = 4 / 255
+
+
+@pytest.fixture(scope="module")
+def noisy(tmp_path_factory):
+    """A sequence whose photos have noise of 4 levels."""
+    folder = tube_sequence.write(tmp_path_factory.mktemp("noisy") / "tube", 6, 160, 120)
+    rng = np.random.default_rng(0)
+    for file in folder.glob("*color.png"):
+        photo = cv2.imread(str(file)).astype(float)
+        cv2.imwrite(
+            str(file), np.clip(photo + 255 * SIGMA * rng.standard_normal(photo.shape), 0, 255).round()
+        )
+    return folder
+
+
+@pytest.fixture(scope="module")
+def twin():
+    return tube_twin.fitted(tube_twin.seen(tube_twin.surface()))
+
+
+def test_noise_is_on_and_as_strong_as_in_the_other_recording(twin, noisy):
+    effects = equipped(twin, {"like": str(noisy)}, "").effects
+    assert effects["noise"].sigma(0.5) == pytest.approx(SIGMA, rel=0.2)
+    assert "noise" not in equipped(twin, {"like": str(noisy), "noise": "off"}, "").effects
+
+
+def test_it_takes_the_place_of_the_twins_own(twin, noisy):
+    loud = replace(twin, effects=Effects([Noise(0.1)]))
+    assert equipped(loud, {"like": str(noisy)}, "").effects["noise"].sigma(0.5) < 0.03
+    assert equipped(loud, {}, "").effects["noise"] == Noise(0.1)
+
+
+def test_the_dataset_has_it_and_names_no_path(twin, noisy, tmp_path):
+    states = parse_states(f"like={noisy}", like=True)
+    poses = np.stack([tube_twin.pose(0.5)])
+    endotwin.synthesize(twin, poses, tmp_path / "d", effects=states)
+    text = (tmp_path / "d" / "dataset.json").read_text()
+    assert '"noise"' in text and str(noisy) not in text
+
+
+def test_it_is_for_synth_alone_and_needs_a_sequence(twin, tmp_path):
+    with pytest.raises(OptionError, match="like=x"):
+        parse_states("like=x")
+    with pytest.raises(SequenceError, match="nowhere"):
+        equipped(twin, {"like": str(tmp_path / "nowhere")}, "")
