@@ -13,7 +13,7 @@ def _leave(number: int, frame: FrameType | None) -> None:
 
 signal.signal(signal.SIGINT, _leave)
 
-from endotwin.cli.stop import Stopped, heed_signals, lose_patience, tell  # noqa: E402
+from endotwin.cli.stop import Stopped, end_if_told, heed_signals, lose_patience, tell  # noqa: E402
 
 
 def main() -> None:
@@ -28,6 +28,7 @@ def main() -> None:
         sys.exit(tell(stopped))
     finally:
         signal.signal(signal.SIGINT, signal.SIG_IGN)  # nothing is left to stop
+        end_if_told()
 
 
 if __name__ == "__main__":
