@@ -1,8 +1,8 @@
 """Puts what a benchmark prints into a page: BENCHMARK | python docs/insert.py PAGE SECTION [--by N].
 
-A page marks a section by <!-- SECTION --> before it and <!-- end --> after it. What has a table goes in as it is,
-anything else as text that is not set. With --by N rows of the section's table stay whose first N cells no new row
-has, so that a command may measure a part of them.
+A page marks a section by <!-- SECTION --> before it and <!-- end --> after it. What has a table goes in as it
+is, anything else as text that is not set. With --by N rows of the section's table stay whose first N cells no
+new row has, so that a command may measure a part of them.
 """
 
 import argparse

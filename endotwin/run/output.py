@@ -145,6 +145,7 @@ def write_folder(
     target = Path(path).resolve()
     with _told(path):
         if target.is_dir():
+            sweep(target.parent)
             _exchange(target, files, mark, own)
             return
         with _parents_made(target), _workplace(target.parent) as work:
@@ -268,9 +269,8 @@ def _settle(place: Path) -> None:
 def _workplace(folder: Path) -> Iterator[Path]:
     """A hidden folder in ``folder`` to write in, gone after the block, as are those of runs that were
     killed."""
+    sweep(folder)
     with _locked(folder):
-        for left in folder.glob(f"{HIDDEN}*/"):
-            _remove_abandoned(left)
         work = Path(tempfile.mkdtemp(prefix=HIDDEN, dir=folder))
         held = locks.take(work)
     try:
@@ -278,6 +278,13 @@ def _workplace(folder: Path) -> Iterator[Path]:
     finally:
         shutil.rmtree(work, ignore_errors=True)
         locks.release(held)
+
+
+def sweep(folder: Path) -> None:
+    """Remove what runs that were killed left half written in ``folder``."""
+    with _locked(folder):
+        for left in folder.glob(f"{HIDDEN}*/"):
+            _remove_abandoned(left)
 
 
 def _remove_abandoned(work: Path) -> None:

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from endotwin.errors import OutputError
 from endotwin.run import locks
-from endotwin.run.output import DATASET, IN_PYTHON, check_free, move_folder, unwritable, was_replaced
+from endotwin.run.output import DATASET, IN_PYTHON, check_free, move_folder, sweep, unwritable, was_replaced
 from endotwin.synth.run.shard import DATA, DONE
 
 JOB, LOCK, GOING = "job.json", "lock", "going"
@@ -45,6 +45,7 @@ class Partial:
         with self._locked():
             finished = self._just_finished(digest)
             if finished:
+                sweep(self.out.absolute().parent)
                 self.remove()
             elif self._digest() != digest:
                 self._begin(digest, overwrite)
