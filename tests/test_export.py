@@ -365,6 +365,21 @@ def test_mitsuba_renders_what_the_twin_renders(twin, tmp_path, effects, diffuse)
     assert psnr(color, view.color, view.mask) > (30 if bounced else 35)
 
 
+@pytest.mark.slow
+@pytest.mark.skipif(find_spec("mitsuba") is None, reason="Mitsuba is not installed (pip install mitsuba)")
+def test_mitsuba_mirrors_the_light_in_the_film_where_the_twin_does(twin, tmp_path):
+    import mitsuba
+
+    mitsuba.set_variant("scalar_rgb")
+    wet = replace(with_film(twin), camera=Pinhole(64, 48, 40.0, 40.0, 26.0, 21.5))
+    wet.export(tmp_path / "scene.mitsuba")
+    pose = tube_twin.pose(0.5)
+    scene = mitsuba.load_file(str(tmp_path / "scene.mitsuba" / "scene.xml"), pose=matrix(pose), spp=36)
+    color = np.clip(np.array(mitsuba.render(scene))[..., :3], 0, 1) ** wet.response.gamma
+    view, dry = wet.render(pose), replace(wet, effects=Effects(())).render(pose)
+    assert psnr(color, view.color, view.mask) > max(30, psnr(color, dry.color, view.mask) + 6)
+
+
 def test_what_cannot_be_exported_is_refused_in_a_sentence_and_leaves_nothing(twin, tmp_path):
     with pytest.raises(OptionError, match=", ".join(FORMATS).replace(".", r"\.")):
         twin.export(tmp_path / "colon.fbx")
