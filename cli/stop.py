@@ -37,9 +37,10 @@ def heed_signals() -> None:
 
 def tell(stopped: Stopped) -> int:
     """Say on stderr what was stopped; the exit code."""
-    _told.append(128 + stopped.args[0])
+    code = 128 + stopped.args[0]
+    _told.append(code)
     print("stopped;", *getattr(stopped, "__notes__", ["nothing was written"]), file=sys.stderr)
-    return _told[0]
+    return code
 
 
 def end_if_told() -> None:
