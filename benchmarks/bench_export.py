@@ -65,7 +65,8 @@ def main() -> None:
     heldout = twin.source.heldout(len(poses))
     frames = [heldout[i] for i in np.linspace(0, len(heldout) - 1, arguments.poses).astype(int)]
     with tempfile.TemporaryDirectory() as folder:
-        files = {suffix: Path(folder) / f"twin{suffix}" for suffix in FORMATS}
+        here = [suffix for suffix in FORMATS if suffix != ".usdz" or find_spec("pxr")]
+        files = {suffix: Path(folder) / f"twin{suffix}" for suffix in here}
         for suffix, file in files.items():
             began = time.perf_counter()
             twin.export(file)

@@ -16,7 +16,7 @@ def export(
         typer.Argument(
             metavar="FILE",
             show_default=False,
-            help="What to write, by its suffix: .glb, .ply, .obj, .html, or .mitsuba (a folder).",
+            help="What to write, by its suffix: .glb, .ply, .obj, .usdz, .html, or .mitsuba (a folder).",
         ),
     ],
     overwrite: console.Overwrite = False,

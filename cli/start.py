@@ -1,11 +1,19 @@
-"""Where the process of a command begins and ends: Ctrl-C is heeded before anything slow is imported."""
+"""Where the process of a command begins and ends: Ctrl-C is heeded before anything else is imported."""
 
-from __future__ import annotations
-
+import os
 import signal
 import sys
+from types import FrameType
 
-from endotwin.cli.stop import Stopped, heed_signals, lose_patience, tell
+
+def _leave(number: int, frame: FrameType | None) -> None:
+    os.write(2, b"stopped; nothing was written\n")
+    os._exit(128 + number)
+
+
+signal.signal(signal.SIGINT, _leave)
+
+from endotwin.cli.stop import Stopped, end_if_told, heed_signals, lose_patience, tell  # noqa: E402
 
 
 def main() -> None:
@@ -20,6 +28,7 @@ def main() -> None:
         sys.exit(tell(stopped))
     finally:
         signal.signal(signal.SIGINT, signal.SIG_IGN)  # nothing is left to stop
+        end_if_told()
 
 
 if __name__ == "__main__":

@@ -8,6 +8,7 @@ import signal
 import socket
 import sys
 import time
+from contextlib import suppress
 from threading import Event, Thread, Timer
 from types import FrameType
 
@@ -23,7 +24,8 @@ UNINTERRUPTED = ("<frozen importlib._bootstrap>", "_workplace")
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 _heeded = Event()
-_told = Event()
+_told: list[int] = []
+"""The exit code, once it was said that the command stops."""
 
 
 class Stopped(BaseException):
@@ -38,9 +40,19 @@ def heed_signals() -> None:
 
 def tell(stopped: Stopped) -> int:
     """Say on stderr what was stopped; the exit code."""
-    _told.set()
+    code = 128 + stopped.args[0]
+    _told.append(code)
     print("stopped;", *getattr(stopped, "__notes__", ["nothing was written"]), file=sys.stderr)
-    return 128 + stopped.args[0]
+    return code
+
+
+def end_if_told() -> None:
+    """End the process at once where it was stopped: graphics and tensors take seconds to be unloaded."""
+    if _told:
+        with suppress(OSError):
+            sys.stdout.flush()
+            sys.stderr.flush()
+        os._exit(_told[0])
 
 
 def lose_patience() -> None:
@@ -57,7 +69,7 @@ def _end_after(listening: socket.socket) -> None:
     time.sleep(PATIENCE_S)
     if _heeded.is_set():
         time.sleep(TIDY_S)
-    if not _told.is_set():
+    if not _told:
         print("stopped", file=sys.stderr, flush=True)
     os._exit(128 + number)
 

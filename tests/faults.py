@@ -12,6 +12,8 @@ from pathlib import Path
 
 import pytest
 
+from endotwin.run import locks
+
 KILLED = 9
 OPERATIONS = ("rename", "replace", "link", "mkdir", "rmdir", "unlink", "fsync")
 
@@ -97,6 +99,44 @@ def _die_at(kill_at: int, work: Callable[[], None]) -> None:
     except BaseException:
         os._exit(1)
     os._exit(0)
+
+
+class Killed(BaseException):
+    """The process is dead."""
+
+
+@contextmanager
+def killed(below: Path, after: int | None) -> Iterator[list[str]]:
+    """From its operation number ``after`` (None: never) below a folder on, the process changes no file, as if
+    it had been killed there: Killed is raised, its locks are let go. Gives the operations that it did.
+
+    Unlike a process that dies, its threads and what libraries have loaded can be used again.
+    """
+    done: list[str] = []
+    held: set[int] = set()
+    take, release = locks.take, locks.release
+
+    def taken(*arguments, **named) -> int:
+        held.add(descriptor := take(*arguments, **named))
+        return descriptor
+
+    def released(descriptor: int) -> None:
+        held.discard(descriptor)
+        release(descriptor)
+
+    def strike(operation: str, path: object) -> None:
+        inside = isinstance(path, int) or str(Path(os.fsdecode(path)).absolute()).startswith(str(below))
+        if inside and after is not None and len(done) >= after:
+            raise Killed
+        if inside:
+            done.append(operation)
+
+    with faults(strike), pytest.MonkeyPatch.context() as patch:
+        patch.setattr(locks, "take", taken)
+        patch.setattr(locks, "release", released)
+        yield done
+    for descriptor in held:
+        os.close(descriptor)
 
 
 @contextmanager

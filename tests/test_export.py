@@ -9,15 +9,18 @@ from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import trimesh
 import tube_twin
+from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from endotwin.cameras import Pinhole
 from endotwin.effects import Effects
 from endotwin.effects.coat import Coat
+from endotwin.effects.film import Film
 from endotwin.effects.interreflection import Interreflection
 from endotwin.effects.offset import Offset
 from endotwin.effects.profile import Profile
@@ -26,7 +29,9 @@ from endotwin.evaluation.metrics import psnr
 from endotwin.export import FORMATS, export
 from endotwin.export.appearance import diffuse_color
 from endotwin.export.mitsuba import matrix
+from endotwin.light import film as light_film
 from endotwin.light import shading
+from endotwin.surface.vectors import unit
 
 TURN = np.diag([1.0, -1.0, -1.0])
 GUIDES = ((3.24, 0.55, 0.0), (-2.77, 2.66, 0.0), (-1.27, -3.14, 0.0))
@@ -59,6 +64,18 @@ def document(files) -> dict:
     return json.loads(content[20 : 20 + length])
 
 
+def with_film(twin):
+    """Wet where the tube's wall is seen from ``pose(0.5)``, with a normal that mirrors a lamp at the lens."""
+    surface, pose = twin.surface, tube_twin.pose(0.5)
+    towards = surface.to_local(pose)[:3, 3] - surface.vertices_mm
+    distance_mm = np.linalg.norm(towards, axis=1)
+    vertex = np.flatnonzero((distance_mm > 8) & (np.arange(len(towards)) % 3 > 0)).astype(np.int32)
+    normal = np.float32(towards / distance_mm[:, None])[vertex]
+    weight = np.linspace(0.2, 1.5, len(vertex), dtype=np.float32)
+    wet = replace(twin.materials, film=light_film.Film(vertex, normal, weight))
+    return with_effects(replace(twin, materials=wet), Film(1.0, 0.2))
+
+
 def with_effects(twin, *effects):
     return replace(twin, effects=Effects(effects))
 
@@ -74,6 +91,112 @@ def test_a_ply_has_every_map_of_every_vertex_by_name(twin, files):
     np.testing.assert_array_equal(rows["roughness"], twin.materials.roughness)
     np.testing.assert_array_equal(rows["seen_by"], twin.surface.seen_by)
     np.testing.assert_array_equal(rows["nearest_mm"], twin.surface.nearest_mm)
+
+
+def test_a_ply_has_the_film_of_every_vertex(twin, tmp_path):
+    wet = with_film(twin)
+    export(wet, tmp_path / "wet.ply")
+    film = wet.materials.film
+    rows = trimesh.load(tmp_path / "wet.ply", process=False).metadata["_ply_raw"]["vertex"]["data"]
+    np.testing.assert_array_equal(np.flatnonzero(rows["film_weight"]), film.vertex)
+    np.testing.assert_array_equal(rows["film_weight"][film.vertex], film.weight)
+    for index, letter in enumerate("xyz"):
+        np.testing.assert_array_equal(rows[f"film_normal_{letter}"][film.vertex], film.normal[:, index])
+
+
+@pytest.mark.slow
+def test_a_film_is_a_clear_coat_with_normals_of_its_own(twin, tmp_path):
+    """Of each texel that a ray meets, weight and normal are those of the film beneath it."""
+    wet = with_film(twin)
+    everywhere = light_film.Film(
+        np.arange(len(twin.surface.vertices_mm), dtype=np.int32),
+        np.float32(twin.surface.normals[:, [1, 2, 0]] * 0.3 + twin.surface.normals),
+        np.linspace(0.5, 1.5, len(twin.surface.vertices_mm), dtype=np.float32),
+    )
+    everywhere = replace(everywhere, normal=np.float32(unit(everywhere.normal)))
+    wet = replace(wet, materials=replace(wet.materials, film=everywhere))
+    export(wet, tmp_path / "wet.glb")
+    content = (tmp_path / "wet.glb").read_bytes()
+    length = struct.unpack_from("<I", content, 12)[0]
+    document, binary = json.loads(content[20 : 20 + length]), content[28 + length :]
+    coat = document["materials"][0]["extensions"]["KHR_materials_clearcoat"]
+
+    def picture(name: str) -> np.ndarray:
+        image = document["images"][document["textures"][coat[name]["index"]]["source"]]
+        view = document["bufferViews"][image["bufferView"]]
+        stored = binary[view["byteOffset"] : view["byteOffset"] + view["byteLength"]]
+        return cv2.imdecode(np.frombuffer(stored, np.uint8), cv2.IMREAD_UNCHANGED)[..., ::-1]
+
+    def attribute(name: str) -> np.ndarray:
+        accessor = document["accessors"][document["meshes"][0]["primitives"][0]["attributes"][name]]
+        start = document["bufferViews"][accessor["bufferView"]]["byteOffset"]
+        width = {"VEC2": 2, "VEC3": 3, "VEC4": 4}[accessor["type"]]
+        return np.frombuffer(binary, "<f4", accessor["count"] * width, start).reshape(-1, width)
+
+    normals = picture("clearcoatNormalTexture")
+    assert normals.dtype == np.uint16
+    height, width, _ = normals.shape
+    u, v = np.clip(attribute("TEXCOORD_0") * [width, height], 0, [width - 1, height - 1]).astype(int).T
+    x, y, z = np.moveaxis(normals[v, u] / 32767.5 - 1, -1, 0)[..., None]
+    facing, tangent = attribute("NORMAL"), attribute("TANGENT")
+    across = np.cross(facing, tangent[:, :3]) * tangent[:, 3:]
+    places = attribute("POSITION") @ TURN * 1000
+    nearest = cKDTree(twin.surface.vertices_mm).query(places)[1]
+    shown = (x * tangent[:, :3] + y * across + z * facing) @ TURN
+    agreement = (shown * everywhere.normal[nearest]).sum(axis=1)
+    assert np.quantile(agreement, 0.05) > 0.98
+    strength = picture("clearcoatTexture")[v, u, 0] / 255 * coat["clearcoatFactor"] * 0.04
+    expected = everywhere.weight[nearest] * shading.F0_WATER
+    assert np.quantile(np.abs(strength - expected), 0.95) < 0.1 * expected.max()
+    assert np.median(picture("clearcoatRoughnessTexture")[v, u, 1]) == round(255 * 0.2)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(find_spec("pxr") is None, reason="USD is not installed (pip install 'endotwin[usd]')")
+def test_usd_finds_mesh_textures_camera_path_and_light_in_a_package_and_nothing_wrong_with_it(twin, tmp_path):
+    from pxr import Usd, UsdGeom, UsdLux, UsdShade, UsdValidation
+
+    from endotwin.synth.trajectories.recorded import path_or_flight
+
+    export(with_effects(twin, Offset(GUIDES), Coat(0.5, 0.1)), tmp_path / "colon.usdz")
+    stage = Usd.Stage.Open(str(tmp_path / "colon.usdz"))
+    validators = UsdValidation.ValidationRegistry().GetOrLoadAllValidators()
+    wrong = UsdValidation.ValidationContext(validators).Validate(stage)
+    assert len(validators) >= 20 and [each.GetMessage() for each in wrong] == []
+    assert (UsdGeom.GetStageUpAxis(stage), UsdGeom.GetStageMetersPerUnit(stage)) == ("Y", 1.0)
+    world = (twin.surface.vertices_mm + twin.surface.origin_mm) @ TURN / 1000
+    prim = stage.GetPrimAtPath("/endotwin/tissue")
+    bounds = UsdGeom.Imageable(prim).ComputeWorldBound(0, "default").ComputeAlignedRange()
+    np.testing.assert_allclose([bounds.min, bounds.max], [world.min(axis=0), world.max(axis=0)], atol=2e-4)
+    material, _ = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial()
+    surface = material.ComputeSurfaceSource()[0]
+    assert surface.GetInput("clearcoat").Get() * 0.04 == pytest.approx(0.5 * shading.F0_WATER)
+    assert ((surface.GetInput("ior").Get() - 1) / (surface.GetInput("ior").Get() + 1)) ** 2 == pytest.approx(
+        twin.materials.f0, rel=1e-5
+    )
+    for name in ("diffuseColor", "roughness", "normal"):
+        texture = UsdShade.Shader(surface.GetInput(name).GetConnectedSources()[0][0].source)
+        assert texture.GetInput("file").Get().resolvedPath.endswith(".png]")
+    poses, camera = path_or_flight(twin), UsdGeom.Camera.Get(stage, "/endotwin/camera")
+    assert stage.GetEndTimeCode() == len(poses) - 1
+    for time in (0, len(poses) - 1):
+        placed = np.array(UsdGeom.XformCache(time).GetLocalToWorldTransform(camera.GetPrim())).T
+        np.testing.assert_allclose(placed[:3, 3], TURN @ poses[time][:3, 3] / 1000, atol=1e-7)
+        np.testing.assert_allclose(placed[:3, :3], TURN @ poses[time][:3, :3] @ TURN, atol=1e-6)
+    lens = camera.GetCamera(0)
+    assert lens.focalLength / lens.horizontalAperture == pytest.approx(
+        tube_twin.CAMERA.fx / tube_twin.CAMERA.width, rel=0.02
+    )
+    lamp = UsdLux.SphereLight.Get(stage, "/endotwin/camera/guide_1")
+    power = lamp.GetIntensityAttr().Get() * np.pi * lamp.GetRadiusAttr().Get() ** 2
+    np.testing.assert_allclose(3 * power / np.pi, 2 * twin.light.L0 * 1e-6, rtol=1e-5)
+
+
+def test_without_usd_a_package_is_refused_in_a_sentence(twin, tmp_path, monkeypatch):
+    monkeypatch.setattr("endotwin.export.usdz.Usd", None)
+    with pytest.raises(OptionError, match=r"endotwin\[usd\]"):
+        export(twin, tmp_path / "colon.usdz")
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.slow
@@ -173,11 +296,15 @@ def test_the_camera_of_a_glb_stands_where_the_path_begins_and_looks_along_it(twi
 
 
 @pytest.mark.slow
-def test_khronos_validator_finds_nothing_wrong_with_a_glb(files):
+@pytest.mark.parametrize("film", [False, True])
+def test_khronos_validator_finds_nothing_wrong_with_a_glb(twin, files, tmp_path, film):
     node = shutil.which("node")
     if not node or subprocess.run([node, "-e", "require('gltf-validator')"], capture_output=True).returncode:
         pytest.skip("node finds no gltf-validator (npm install gltf-validator, NODE_PATH)")
-    done = subprocess.run([node, "-e", VALIDATE, files / "colon.glb"], capture_output=True, check=True)
+    file = (tmp_path if film else files) / "colon.glb"
+    if film:
+        export(with_film(twin), file)
+    done = subprocess.run([node, "-e", VALIDATE, file], capture_output=True, check=True)
     issues = json.loads(done.stdout)["issues"]
     assert (issues["numErrors"], issues["numWarnings"]) == (0, 0), issues["messages"]
 
@@ -236,6 +363,21 @@ def test_mitsuba_renders_what_the_twin_renders(twin, tmp_path, effects, diffuse)
     ratio = np.median(radiance[view.mask] / view.radiance[view.mask])
     assert ratio == pytest.approx(1, abs=0.07 if bounced else 0.02)
     assert psnr(color, view.color, view.mask) > (30 if bounced else 35)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(find_spec("mitsuba") is None, reason="Mitsuba is not installed (pip install mitsuba)")
+def test_mitsuba_mirrors_the_light_in_the_film_where_the_twin_does(twin, tmp_path):
+    import mitsuba
+
+    mitsuba.set_variant("scalar_rgb")
+    wet = replace(with_film(twin), camera=Pinhole(64, 48, 40.0, 40.0, 26.0, 21.5))
+    wet.export(tmp_path / "scene.mitsuba")
+    pose = tube_twin.pose(0.5)
+    scene = mitsuba.load_file(str(tmp_path / "scene.mitsuba" / "scene.xml"), pose=matrix(pose), spp=36)
+    color = np.clip(np.array(mitsuba.render(scene))[..., :3], 0, 1) ** wet.response.gamma
+    view, dry = wet.render(pose), replace(wet, effects=Effects(())).render(pose)
+    assert psnr(color, view.color, view.mask) > max(30, psnr(color, dry.color, view.mask) + 6)
 
 
 def test_what_cannot_be_exported_is_refused_in_a_sentence_and_leaves_nothing(twin, tmp_path):

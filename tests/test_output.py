@@ -3,6 +3,7 @@
 import errno
 import os
 import re
+import shutil
 import stat
 from pathlib import Path
 
@@ -173,18 +174,22 @@ def write_texts(folder: Path, **texts: str) -> None:
 
 
 @pytest.mark.parametrize("links", [True, False])
+@pytest.mark.parametrize("swaps", [True, False])
 def test_a_folder_takes_the_place_of_another_with_the_users_files_wherever_it_is_killed(
-    tmp_path, monkeypatch, links
+    tmp_path, monkeypatch, links, swaps
 ):
     def no_link(*_, **__) -> None:
         raise OSError(errno.EPERM, "this file system has no links")
 
     if not links:
         monkeypatch.setattr(os, "link", no_link)
+    if not swaps:
+        monkeypatch.setattr("endotwin.run.output.exchanged", lambda *_: False)
     new, out = tmp_path / "new", tmp_path / "out"
     guests = {"mine": "1", "notes/mine": "2"}
 
     def begin() -> None:
+        shutil.rmtree(out, ignore_errors=True)
         write_texts(new, a="new", b="new")
         write_texts(out, a="old", c="old", mine="1", notes_mine="2")
 
@@ -194,6 +199,9 @@ def test_a_folder_takes_the_place_of_another_with_the_users_files_wherever_it_is
     def look() -> None:
         there = contents(tmp_path)
         assert set(guests.values()) <= set(there.values())
+        if swaps:
+            visible = {name: text for name, text in contents(out).items() if ".endotwin" not in name}
+            assert visible in ({"a": "old", "c": "old", **guests}, {"a": "new", "b": "new", **guests})
         if new.exists():
             work()
         assert contents(out) == {"a": "new", "b": "new", **guests}

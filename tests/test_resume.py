@@ -14,6 +14,8 @@ import pytest
 import tube_twin
 
 from endotwin.errors import OptionError, OutputError
+from endotwin.run import output
+from endotwin.run.exchange import exchanged
 from endotwin.synth import Trajectory, Variation, make_job, synthesize
 from endotwin.synth.labels import Labeller
 from endotwin.synth.run import crew
@@ -243,9 +245,15 @@ def test_a_dataset_that_is_replaced_keeps_what_others_put_into_it(twin, whole, t
     def stopped(*_) -> None:
         raise Stopped
 
-    with pytest.MonkeyPatch.context() as patch, pytest.raises(Stopped):
-        patch.setattr(Partial, "remove", stopped)
-        render(twin, out, overwrite=True)
+    def stopped_after_the_exchange(one: Path, other: Path) -> None:
+        assert exchanged(one, other)
+        raise Stopped
+
+    places = [(output, "exchanged", stopped_after_the_exchange)] if sys.platform == "linux" else []
+    for home, name, stop in [*places, (Partial, "remove", stopped)]:
+        with pytest.MonkeyPatch.context() as patch, pytest.raises(Stopped):
+            patch.setattr(home, name, stop)
+            render(twin, out, overwrite=True)
     render(twin, out, overwrite=True)
     guests = {"0000_extra.tiff": b"endotwin's no more", "splits/0001_color.png": b"mine"}
     assert contents(out) == {**whole, **guests}

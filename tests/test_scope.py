@@ -21,10 +21,11 @@ from endotwin.errors import OptionError
 from endotwin.evaluation.metrics import psnr
 from endotwin.look import inspector
 from endotwin.look.scope import QUICK_PX, Scope
+from endotwin.look.scopepane import SWITCH_PX
 from endotwin.pipeline import synthesize
 from endotwin.render import Renderer
 from endotwin.sequence.poses import read_poses
-from endotwin.twin import Light, Source
+from endotwin.twin import Light, Source, Twin
 
 
 @pytest.fixture(scope="module")
@@ -213,6 +214,12 @@ class Window:
             self.tool(*words)
             time.sleep(0.3)
 
+    def click(self, place: tuple[int, int]) -> None:
+        self.tool("mousemove", "--window", self.id, *place)
+        time.sleep(0.3)
+        self.tool("click", 1)
+        time.sleep(0.3)
+
     def size(self) -> tuple[int, int]:
         told = self.tool("getwindowgeometry", "--shell", self.id)
         values = dict(line.split("=") for line in told.split())
@@ -233,8 +240,8 @@ needs_a_screen = pytest.mark.skipif(
 def window(twin, tmp_path):
     opened = []
 
-    def open_window(screen: str) -> Window:
-        twin.save(tmp_path / "twin")
+    def open_window(screen: str, shown: Twin = twin) -> Window:
+        shown.save(tmp_path / "twin")
         opened.append(Window(tmp_path / "twin", tmp_path, screen))
         return opened[-1]
 
@@ -270,6 +277,33 @@ def test_keys_mouse_and_sliders_of_a_real_window_fly_and_light_the_scope(window,
     shown.drag(pane, (pane[0] + 60, pane[1]))
     assert np.abs(shown.picture() - lit).mean() > 3
     assert shown.inspector.poll() is None
+
+
+@pytest.mark.slow
+@needs_a_screen
+def test_a_click_on_a_switch_of_a_real_window_takes_its_effect_from_the_view_and_gives_it_back(window, twin):
+    offset, coat = Offset(((3.0, 0.0, 0.0),)), Coat(3.0, 0.1)
+    shown = window("1600x1200", replace(twin, effects=Effects([offset, coat])))
+    pose = Scope(twin).pose
+
+    def agrees(*effects) -> None:
+        expected = Renderer(replace(twin, effects=Effects(effects))).view(pose).color * 255
+        np.testing.assert_allclose(shown.picture()[..., ::-1], expected, atol=1)
+
+    _, height = shown.size()
+    switches = {
+        name: (12 + SWITCH_PX // 2, round(0.58 * height - (1.5 * row + 0.5) * SWITCH_PX))
+        for row, name in enumerate(("offset", "coat"))
+    }
+    agrees(offset, coat)
+    shown.click(switches["coat"])
+    agrees(offset)
+    shown.click(switches["offset"])
+    agrees()
+    shown.click(switches["coat"])
+    agrees(coat)
+    shown.click(switches["offset"])
+    agrees(offset, coat)
 
 
 @pytest.mark.slow

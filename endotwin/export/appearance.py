@@ -35,6 +35,7 @@ class Appearance:
         f0: specular reflectance at normal incidence. burley: whether the diffuse lobe is Burley's.
         coat_f0, coat_roughness, coat_tail: reflectance, times its weight, roughness and tail of the wet coat;
             a reflectance of 0: no coat.
+        film_f0, film_roughness: those of a film of weight 1; 0: no film.
         vignetting_k2, vignetting_k4: transmission exp(k2·r² + k4·r⁴) of the lens.
         bounce: strength of light that other tissue throws.
         usual_mm: the distance from which tissue is usually seen.
@@ -51,6 +52,8 @@ class Appearance:
     coat_f0: float
     coat_roughness: float
     coat_tail: float
+    film_f0: float
+    film_roughness: float
     vignetting_k2: float
     vignetting_k4: float
     bounce: float
@@ -61,6 +64,7 @@ class Appearance:
         """What ``twin`` has."""
         effects = twin.effects
         coat, lens = effects.get("coat"), effects.get("vignetting")
+        film = effects.get("film") if twin.materials.film else None
         return cls(
             L0=twin.light.L0,
             n=twin.light.n,
@@ -73,6 +77,8 @@ class Appearance:
             coat_f0=coat.weight * shading.F0_WATER if coat else 0.0,
             coat_roughness=coat.roughness if coat else 0.0,
             coat_tail=coat.tail if coat else 2.0,
+            film_f0=film.amount * shading.F0_WATER if film else 0.0,
+            film_roughness=film.roughness if film else 0.0,
             vignetting_k2=lens.k2 if lens else 0.0,
             vignetting_k4=lens.k4 if lens else 0.0,
             bounce=effects.bounce,

@@ -14,6 +14,7 @@ FORMATS = {
     ".glb": "glTF 2.0: textured mesh, camera path, lights; metres, Y up",
     ".ply": "mesh with every map as a named property of its vertices; mm",
     ".obj": "textured mesh, with .mtl and three .png beside it; mm",
+    ".usdz": "USD: textured mesh, camera path, lights; metres, Y up",
     ".html": "a page that shows the twin in any browser, without a network",
     ".mitsuba": "folder with a scene of Mitsuba 3; mm",
 }

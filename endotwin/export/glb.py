@@ -47,7 +47,7 @@ def glb(twin: Twin) -> bytes:
     parts = _Parts()
     document = {
         "asset": {"version": "2.0", "generator": "endotwin"},
-        "extensionsUsed": sorted({LIGHTS, SPECULAR} | ({COAT} if look.coat_f0 else set())),
+        "extensionsUsed": sorted({LIGHTS, SPECULAR} | ({COAT} if look.coat_f0 or look.film_f0 else set())),
         "scene": 0,
         "extras": {"mm_per_unit": 1 / M_PER_MM, "endotwin": look.to_dict()},
         **_material(parts, look, mesh),
@@ -59,7 +59,7 @@ def glb(twin: Twin) -> bytes:
     guides = [_guide(number, guide_mm) for number, guide_mm in enumerate(look.guides_mm)]
     camera = {"name": "camera", "camera": 0, "children": list(range(2, 2 + len(guides)))}
     if len(poses):
-        places, turns = _path(poses)
+        places, turns = path_in_m(poses)
         camera |= {"translation": places[0].tolist(), "rotation": turns[0].tolist()}
         document["animations"] = [_animation(parts, places, turns)]
     document["nodes"] = [tissue, camera, *guides]
@@ -123,16 +123,19 @@ def _material(parts: _Parts, look: Appearance, mesh: Textured) -> dict:
     """
     rough = np.zeros((*mesh.roughness.shape, 3), np.float32)
     rough[..., 1] = np.maximum(mesh.roughness, ROUGHNESS_MIN)
-    pictures = {"base colour": srgb(mesh.base_color), "roughness": rough, "normal": mesh.normal / 2 + 0.5}
-    images = [
-        {"name": name, "mimeType": "image/png", "bufferView": parts.view(png(picture))}
-        for name, picture in pictures.items()
-    ]
+    pictures = {"base colour": png(srgb(mesh.base_color)), "roughness": png(rough)}
+    pictures["normal"] = png(mesh.normal / 2 + 0.5)
     shine = {"specularFactor": 1.0, "specularColorFactor": [look.f0 / F0_DIELECTRIC] * 3}
     extensions = {SPECULAR: shine}
-    if look.coat_f0:
+    if look.film_f0:
+        extensions[COAT] = _film(look, mesh, pictures)
+    elif look.coat_f0:
         weight = min(look.coat_f0 / F0_DIELECTRIC, 1.0)
         extensions[COAT] = {"clearcoatFactor": weight, "clearcoatRoughnessFactor": look.coat_roughness}
+    images = [
+        {"name": name, "mimeType": "image/png", "bufferView": parts.view(picture)}
+        for name, picture in pictures.items()
+    ]
     surface = {
         "baseColorTexture": {"index": 0},
         "metallicRoughnessTexture": {"index": 1},
@@ -144,6 +147,27 @@ def _material(parts: _Parts, look: Appearance, mesh: Textured) -> dict:
         "samplers": [{"magFilter": 9729, "minFilter": 9987, "wrapS": 33071, "wrapT": 33071}],
         "textures": [{"source": index, "sampler": 0} for index in range(len(images))],
         "materials": [{**material, "doubleSided": True, "extensions": extensions}],
+    }
+
+
+def _film(look: Appearance, mesh: Textured, pictures: dict[str, bytes]) -> dict:
+    """The film, and the coat where no film is, as a clear coat; its textures are added to ``pictures``.
+
+    Its lobe is so narrow that its normals need 16 bits."""
+    factor = np.maximum(mesh.film_weight * look.film_f0, look.coat_f0) / F0_DIELECTRIC
+    wet = mesh.film_weight * look.film_f0 > look.coat_f0
+    coat = np.zeros((*factor.shape, 3), np.float32)
+    coat[..., 0], coat[..., 1] = factor, np.where(wet, look.film_roughness, look.coat_roughness)
+    normal = np.where(wet[..., None], mesh.film_normal, mesh.normal) / 2 + 0.5
+    textures = {"film": png(coat), "film normal": png(normal, np.uint16)}
+    first = len(pictures)
+    pictures.update(textures)
+    return {
+        "clearcoatFactor": 1.0,
+        "clearcoatTexture": {"index": first},
+        "clearcoatRoughnessFactor": 1.0,
+        "clearcoatRoughnessTexture": {"index": first},
+        "clearcoatNormalTexture": {"index": first + 1},
     }
 
 
@@ -173,7 +197,7 @@ def _guide(number: int, guide_mm: tuple[float, float, float]) -> dict:
     return {"name": f"guide {number}", "translation": place, "extensions": {LIGHTS: {"light": 0}}}
 
 
-def _path(poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def path_in_m(poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Translations float32 [N, 3] and unit quaternions [N, 4] (x, y, z, w) of a path, of one sign."""
     places = (poses[:, :3, 3] @ TURN * M_PER_MM).astype(np.float32)
     turns = Rotation.from_matrix(TURN @ poses[:, :3, :3] @ TURN).as_quat()
@@ -202,9 +226,9 @@ def srgb(linear: np.ndarray) -> np.ndarray:
     return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
 
 
-def png(picture: np.ndarray) -> bytes:
-    """A picture [H, W, 3], RGB in [0, 1], or [H, W], as a PNG file of 8 bits."""
-    values = np.rint(np.clip(picture, 0, 1) * 255).astype(np.uint8)
+def png(picture: np.ndarray, kind: type = np.uint8) -> bytes:
+    """A picture [H, W, 3], RGB in [0, 1], or [H, W], as a PNG file of unsigned numbers of that ``kind``."""
+    values = np.rint(np.clip(picture, 0, 1) * np.iinfo(kind).max).astype(kind)
     return cv2.imencode(".png", values[..., ::-1] if values.ndim == 3 else values)[1].tobytes()
 
 

@@ -25,6 +25,7 @@ from endotwin.synth.trajectories.recorded import path_or_flight
 from endotwin.twin import Twin
 
 VERTEX = np.dtype([("place", "<u2", 4), ("facing", "<i2", 2), ("color", "u1", 4)])
+WET = np.dtype([("facing", "<i2", 2), ("weight", "<f4")])
 PARTS = {"vertex": "vertex.glsl", "fragment": "fragment.glsl", "script": "view.js"}
 
 
@@ -49,7 +50,8 @@ def page(twin: Twin) -> str:
         "vertices": len(surface.vertices_mm),
         "triangles": len(surface.triangles),
     }
-    content = _vertices(twin, low, extent).tobytes() + surface.triangles.astype("<u4").tobytes()
+    parts_of_mesh = (_vertices(twin, low, extent), surface.triangles.astype("<u4"), _wet(twin))
+    content = b"".join(part.tobytes() for part in parts_of_mesh)
     mesh = base64.b64encode(gzip.compress(content, 9, mtime=0)).decode()
     template = Template((folder / "page.html").read_text(encoding="utf-8"))
     title = f"endotwin: {Path(twin.source.path).name}".replace("&", "&amp;").replace("<", "&lt;")
@@ -63,6 +65,17 @@ def _vertices(twin: Twin, low: np.ndarray, extent: np.ndarray) -> np.ndarray:
     rows["place"] = np.rint(65535 * np.clip(np.c_[within, twin.materials.roughness], 0, 1))
     rows["facing"] = np.rint(32767 * _folded(twin.surface.normals))
     rows["color"][:, :3] = np.rint(255 * np.sqrt(np.clip(diffuse_color(twin), 0, 1)))
+    return rows
+
+
+def _wet(twin: Twin) -> np.ndarray:
+    """The film on each vertex, WET [V]; [0] without one."""
+    film, count = twin.materials.film, len(twin.surface.vertices_mm)
+    if film is None or "film" not in twin.effects:
+        return np.zeros(0, WET)
+    rows = np.zeros(count, WET)
+    rows["facing"] = film.on_all(np.rint(32767 * _folded(film.normal)), count)
+    rows["weight"] = film.on_all(film.weight, count)
     return rows
 
 

@@ -18,10 +18,13 @@ import numpy as np
 from endotwin.cameras.perspective import as_pinhole
 from endotwin.export.appearance import Appearance, diffuse_color
 from endotwin.export.ply import named, ply
+from endotwin.light.film import Film
 from endotwin.light.guides import AT_LENS, log_axis
 from endotwin.light.incidence import COS_MIN
 from endotwin.light.shading import ROUGHNESS_MIN
 from endotwin.run.output import write_folder
+from endotwin.surface import Surface
+from endotwin.surface.vectors import dot, unit
 from endotwin.synth.trajectories.recorded import path_or_flight
 from endotwin.twin import Twin
 from endotwin.twin.meshes import world_vertices_mm
@@ -51,7 +54,7 @@ def write_mitsuba(twin: Twin, path: Path, overwrite: bool = False) -> None:
     look, poses, field = Appearance.of(twin), path_or_flight(twin), field_degrees(twin)
     lobes = _lobes(look)
     files = {
-        "tissue.ply": _mesh(twin, len(lobes)),
+        "tissue.ply": _mesh(twin, look, len(lobes)),
         "profile.pfm": _profile(look, field),
         "poses.txt": "".join(f"{matrix(pose)}\n" for pose in poses).encode(),
         "endotwin.json": (json.dumps(look.to_dict(), indent=1) + "\n").encode(),
@@ -74,12 +77,47 @@ def field_degrees(twin: Twin) -> float:
     return float(np.clip(2 * math.degrees(math.atan(reach)), *FIELD_DEGREES))
 
 
-def _mesh(twin: Twin, scale: int) -> bytes:
-    """The mesh, with the materials as attributes; base colour times ``scale``."""
-    columns = {**named("", world_vertices_mm(twin), "xyz"), **named("n", twin.surface.normals, "xyz")}
-    columns |= named("base_color_", scale * diffuse_color(twin), "012")
-    columns["roughness_0"] = np.maximum(twin.materials.roughness, ROUGHNESS_MIN)
-    return ply(columns, twin.surface.triangles)
+def _mesh(twin: Twin, look: Appearance, scale: int) -> bytes:
+    """The mesh, with the materials as attributes; base colour and the film's reflectance times ``scale``."""
+    places, normals = world_vertices_mm(twin), twin.surface.normals
+    triangles, row, film = twin.surface.triangles, slice(None), {}
+    if look.film_f0:
+        triangles, row, film = _wet(twin.materials.film, twin.surface, scale * look.film_f0)
+    columns = {**named("", places[row], "xyz"), **named("n", normals[row], "xyz")}
+    columns |= named("base_color_", scale * diffuse_color(twin)[row], "012")
+    columns["roughness_0"] = np.maximum(twin.materials.roughness[row], ROUGHNESS_MIN)
+    return ply(columns | film, triangles)
+
+
+def _wet(film: Film, surface: Surface, f0: float) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
+    """The film as attributes of a mesh whose wet triangles have corners of their own: the frame that a normal
+    map of Mitsuba's is in has its first axis along the first edge of each triangle.
+
+    Returns:
+        triangles [F, 3]; for each vertex of the new mesh the one that it was, [W]; columns [W].
+    """
+    count = len(surface.vertices_mm)
+    weight = film.on_all(film.weight, count)
+    wet = (weight[surface.triangles] > 0).any(axis=1)
+    corners = surface.triangles[wet]
+    row = np.concatenate([np.arange(count), corners.ravel()])
+    triangles = surface.triangles.copy()
+    triangles[wet] = count + np.arange(corners.size).reshape(-1, 3)
+    level = surface.normals + 0.0
+    level[film.vertex] = film.normal
+    wettest = np.take_along_axis(corners, weight[corners].argmax(axis=1)[:, None], axis=1)
+    own = np.where(
+        weight[corners] > 0, corners, wettest
+    )  # a dry corner levels off as the wettest of its triangle does
+    first = surface.vertices_mm[corners[:, 1]] - surface.vertices_mm[corners[:, 0]]
+    along = np.repeat(first, 3, axis=0)
+    facing = surface.normals[corners.ravel()]
+    along = unit(along - dot(along, facing)[:, None] * facing)
+    normal = level[own.ravel()]
+    local = np.stack([dot(normal, along), dot(normal, np.cross(facing, along)), dot(normal, facing)], axis=1)
+    mirror = np.concatenate([np.tile(np.float32([0, 0, 1]), (count, 1)), local]) / 2 + 0.5
+    mirrored = np.repeat(f0 * weight[row][:, None], 3, axis=1)
+    return triangles, row, {**named("film_", mirrored, "012"), **named("mirror_", mirror, "012")}
 
 
 def _profile(look: Appearance, field: float) -> bytes:
@@ -98,7 +136,7 @@ def _profile(look: Appearance, field: float) -> bytes:
 def _lobes(look: Appearance) -> list[xml.Element]:
     """What the tissue answers light with. Mitsuba has no sum of lobes, only means: of K lobes each is K times
     as strong."""
-    count = 1 + (not look.burley) + (look.coat_f0 > 0)
+    count = 1 + (not look.burley) + (look.coat_f0 > 0) + (look.film_f0 > 0)
     shine = _attribute("roughness", "vertex_roughness")
     if look.burley:
         lobes = [_lobe("principled", _attribute("base_color", "vertex_base_color"), shine, look.f0 * count)]
@@ -108,6 +146,11 @@ def _lobes(look: Appearance) -> list[xml.Element]:
     if look.coat_f0 > 0:
         roughness = _value("float", "roughness", look.coat_roughness)
         lobes.append(_lobe("principled", _black(), roughness, look.coat_f0 * count))
+    if look.film_f0 > 0:
+        metal, roughness = _value("float", "metallic", 1), _value("float", "roughness", look.film_roughness)
+        film = _lobe("principled", _attribute("base_color", "vertex_film"), metal, roughness)
+        plain = _value("boolean", "use_shadowing_function", "false")
+        lobes.append(_lobe("normalmap", _attribute("normalmap", "vertex_mirror"), plain, film))
     return lobes
 
 

@@ -48,5 +48,6 @@ def twin_ply(twin: Twin) -> bytes:
     columns = {**named("", world_vertices_mm(twin), "xyz"), **named("n", twin.surface.normals, "xyz")}
     columns |= dict(zip(("red", "green", "blue"), display_color(twin).T, strict=True))
     for name, values in vertex_attributes(twin).items():
-        columns |= named(f"{name}_", values, "rgb") if values.ndim == 2 else {name: values}
+        letters = "xyz" if name.endswith("normal") else "rgb"
+        columns |= named(f"{name}_", values, letters) if values.ndim == 2 else {name: values}
     return ply(columns, twin.surface.triangles)

@@ -42,6 +42,9 @@ GUTTER = 2
 REACH = 0.02
 """How far from the lighter mesh the twin's surface is looked for, as a share of the mesh's size."""
 
+DRY = 1e-6
+"""What the surface's own normal counts beside that of a film of weight 1."""
+
 SKEW = np.array([0.1, 0.2, 0.3])
 """Turns any direction into another one."""
 
@@ -56,6 +59,8 @@ class Textured:
         base_color: float32 [H, W, 3], linear: that of the diffuse lobe. roughness: float32 [H, W].
         normal: float32 [H, W, 3], unit, in the basis of ``tangents`` (glTF 2.0, 3.7.2.1: x, y, z along
             tangent, bitangent, normal).
+        film_weight: float32 [H, W]. film_normal: float32 [H, W, 3], as ``normal``, which it is where no film
+            is. None without a film.
     """
 
     vertices_mm: np.ndarray
@@ -65,6 +70,8 @@ class Textured:
     base_color: np.ndarray
     roughness: np.ndarray
     normal: np.ndarray
+    film_weight: np.ndarray | None = None
+    film_normal: np.ndarray | None = None
 
     @cached_property
     def tangents(self) -> np.ndarray:
@@ -82,14 +89,27 @@ def textured(twin: Twin) -> Textured:
     low = Surface.from_mesh(vertices, triangles, normals)
     points = flat.interpolate(low, vertices)
     facing = unit(flat.interpolate(low, normals))
-    maps = np.concatenate([surface.normals, diffuse_color(twin), twin.materials.roughness[:, None]], axis=1)
-    found = _nearest(surface, points, facing, maps)
+    maps = [surface.normals, diffuse_color(twin), twin.materials.roughness[:, None], *_film(twin)]
+    found = _nearest(surface, points, facing, np.concatenate(maps, axis=1))
     tangents = flat.interpolate(low, _tangents(vertices, normals, uv, triangles))
-    layers = np.concatenate([_in_basis(unit(found[:, :3]), facing, tangents), found[:, 3:]], axis=1)
-    image = np.zeros((size[1] * size[0], 7), np.float32)
-    image[flat.pixel] = layers
-    image = _spread(image.reshape(size[1], size[0], 7), inside)
-    return Textured(vertices, normals, uv, triangles, image[..., 3:6], image[..., 6], unit(image[..., :3]))
+    for normal in (found[:, :3], found[:, 8:]):
+        if normal.size:
+            normal[:] = _in_basis(unit(normal), facing, tangents)
+    image = np.zeros((size[1] * size[0], found.shape[1]), np.float32)
+    image[flat.pixel] = found
+    image = _spread(image.reshape(size[1], size[0], -1), inside)
+    textures = [unit(image[..., :3])] + ([image[..., 7], unit(image[..., 8:])] if image.shape[2] > 7 else [])
+    return Textured(vertices, normals, uv, triangles, image[..., 3:6], image[..., 6], *textures)
+
+
+def _film(twin: Twin) -> list[np.ndarray]:
+    """Weight [V, 1] of the film and normals [V, 3] of no unit length, so that dry vertices count for nothing
+    beside wet ones; none without a film."""
+    if "film" not in twin.effects or (film := twin.materials.film) is None:
+        return []
+    count = len(twin.surface.vertices_mm)
+    weight, normal = film.on_all(film.weight, count), film.on_all(film.weight[:, None] * film.normal, count)
+    return [weight[:, None], normal + DRY * twin.surface.normals]
 
 
 def texel_mm(twin: Twin) -> float:

@@ -39,8 +39,8 @@ class Film:
         return len(self.vertex)
 
     def on_all(self, values: np.ndarray, count: int) -> np.ndarray:
-        """``values`` [M] on all ``count`` vertices of the surface, float32 [count]: 0 where no film is."""
-        everywhere = np.zeros(count, np.float32)
+        """``values`` [M] or [M, C] on all ``count`` vertices of the surface, float32: 0 where no film is."""
+        everywhere = np.zeros((count, *values.shape[1:]), np.float32)
         everywhere[self.vertex] = values
         return everywhere
 

@@ -182,6 +182,7 @@ class Renderer:
         mean, count = self._mean_radiance(np.argwhere(edges)[:, ::-1], light, T_world_camera)
         radiance[edges] = np.where(count[:, None] > 0, mean, radiance[edges])
         told[edges] |= count > 0
+        told &= ~_alone(edges & (radiance.max(axis=2) == 0))
         _close_slits(radiance, told, edges)
         radiance *= self._exposure * exposure
         if self._transmission is not None:
@@ -246,6 +247,13 @@ def _normal_and_material(twin: Twin) -> np.ndarray:
     materials = twin.materials
     columns = [materials.base_color, materials.roughness[:, None], materials.metallic[:, None]]
     return np.concatenate([twin.surface.normals, *columns], axis=1)
+
+
+def _alone(pixels: np.ndarray) -> np.ndarray:
+    """Those of the ``pixels``, bool [H, W], beside which is no other: a single one that no guide lights, at a
+    rim, is a shadow narrower than depth maps tell."""
+    count = cv2.boxFilter(pixels.view(np.uint8), -1, (3, 3), normalize=False, borderType=cv2.BORDER_CONSTANT)
+    return pixels & (count == 1)
 
 
 def _close_slits(radiance: np.ndarray, told: np.ndarray, edges: np.ndarray) -> None:

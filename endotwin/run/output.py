@@ -20,11 +20,15 @@ from pathlib import Path
 
 from endotwin.errors import OutputError
 from endotwin.run import locks
+from endotwin.run.exchange import exchanged
 
 TWIN, DATASET, TRADEOFF = "twin.json", "dataset.json", "ladder.json"
 """Marks of the folders that endotwin writes."""
 
 HIDDEN = ".endotwin-"
+REPLACED = f"{HIDDEN}replaced"
+"""Marks a folder whose place another takes."""
+
 ABANDONED_S = 24 * 3600.0
 """Where there are no locks, what is older was left by a run that was killed."""
 
@@ -141,6 +145,7 @@ def write_folder(
     target = Path(path).resolve()
     with _told(path):
         if target.is_dir():
+            sweep(target.parent)
             _exchange(target, files, mark, own)
             return
         with _parents_made(target), _workplace(target.parent) as work:
@@ -157,6 +162,8 @@ def move_folder(new: Path, path: Path, own: Callable[[Path], bool]) -> None:
     """Put the whole folder ``new`` in the place of ``path``, whose files that are not ``own`` go with it.
 
     Until its last rename ``new`` is whole beside ``path``, and a run that was killed can do the same again.
+    Where the system can exchange two names, ``path`` is the old folder or the new one at every instant;
+    elsewhere it takes two renames.
 
     Args:
         own: whether a file of ``path``, by its relative path, is endotwin's to replace.
@@ -166,15 +173,31 @@ def move_folder(new: Path, path: Path, own: Callable[[Path], bool]) -> None:
     """
     path = Path(path).absolute()
     with _workplace(path.parent) as aside:
-        if path.exists():
-            _adopt(path, new, own)
-            path.rename(aside / path.name)
-        try:
+        old = aside / path.name
+        if not path.exists():
             new.rename(path)
-        except BaseException:
-            with suppress(OSError):
-                (aside / path.name).rename(path)
-            raise
+        elif was_replaced(new):
+            new.rename(old)
+        else:
+            _adopt(path, new, own)
+            (path / REPLACED).write_bytes(b"")
+            if exchanged(new, path):
+                new.rename(old)
+                return
+            path.rename(old)
+            try:
+                new.rename(path)
+            except BaseException:
+                with suppress(OSError):
+                    old.rename(path)
+                    (path / REPLACED).unlink()
+                raise
+
+
+def was_replaced(folder: Path) -> bool:
+    """Whether another folder has taken the place of ``folder``, in a run that was killed before it removed
+    this one."""
+    return (folder / REPLACED).exists()
 
 
 def _adopt(old: Path, new: Path, own: Callable[[Path], bool]) -> None:
@@ -183,7 +206,7 @@ def _adopt(old: Path, new: Path, own: Callable[[Path], bool]) -> None:
     for file in files:
         name = file.relative_to(old)
         target = new / name
-        if own(name):
+        if own(name) or name.name == REPLACED:
             continue
         if target.exists():
             if target.samefile(file) or filecmp.cmp(target, file, shallow=False):
@@ -246,9 +269,8 @@ def _settle(place: Path) -> None:
 def _workplace(folder: Path) -> Iterator[Path]:
     """A hidden folder in ``folder`` to write in, gone after the block, as are those of runs that were
     killed."""
+    sweep(folder)
     with _locked(folder):
-        for left in folder.glob(f"{HIDDEN}*/"):
-            _remove_abandoned(left)
         work = Path(tempfile.mkdtemp(prefix=HIDDEN, dir=folder))
         held = locks.take(work)
     try:
@@ -256,6 +278,13 @@ def _workplace(folder: Path) -> Iterator[Path]:
     finally:
         shutil.rmtree(work, ignore_errors=True)
         locks.release(held)
+
+
+def sweep(folder: Path) -> None:
+    """Remove what runs that were killed left half written in ``folder``."""
+    with _locked(folder):
+        for left in folder.glob(f"{HIDDEN}*/"):
+            _remove_abandoned(left)
 
 
 def _remove_abandoned(work: Path) -> None:

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from endotwin.errors import OutputError
-from endotwin.run.output import TRADEOFF, check_free, move_folder, unwritable
+from endotwin.run.output import TRADEOFF, check_free, move_folder, unwritable, was_replaced
 from endotwin.sequence import Sequence
 from endotwin.sequence.readers import open_sequence
 from endotwin.tradeoff import crops, effects, plot, report
@@ -121,6 +121,8 @@ def _climbed(
 def _enter(work: Path, asked: dict) -> None:
     """Make the working folder, or go on in it if it was made for the same sequence and geometry."""
     question = work / TRADEOFF
+    if was_replaced(work):
+        shutil.rmtree(work)
     if question.exists():
         if json.loads(question.read_text(encoding="utf-8")) != asked:
             raise OutputError(

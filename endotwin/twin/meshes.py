@@ -22,10 +22,14 @@ DISPLAY_GAMMA = 2.2
 
 
 def vertex_attributes(twin: Twin) -> dict[str, np.ndarray]:
-    """All that is known of each vertex, by name: the materials, [V] or [V, 3], once the twin is fitted, and
-    the coverage ``seen_by``, ``nearest_mm`` and ``filled`` [V] (see ``Surface``)."""
+    """All that is known of each vertex, by name: the materials, [V] or [V, 3], once the twin is fitted, with
+    ``film_weight`` [V] and ``film_normal`` [V, 3] (see ``Film``) where it has a film, and the coverage
+    ``seen_by``, ``nearest_mm`` and ``filled`` [V] (see ``Surface``)."""
     materials = twin.materials.per_vertex if twin.fitted else {}
     surface = twin.surface
+    if twin.fitted and (film := twin.materials.film) is not None:
+        for name in ("weight", "normal"):
+            materials[f"film_{name}"] = film.on_all(getattr(film, name), len(surface.vertices_mm))
     coverage = {name: getattr(surface, name) for name in ("seen_by", "nearest_mm", "filled")}
     return {**materials, **coverage}
 

@@ -1,8 +1,9 @@
 #version 300 es
 // endotwin's light on tissue: light/forward.py and light/shading.py, in the same words.
 precision highp float;
+precision highp int;
 in vec3 point, normal, base;
-in float rough;
+in float rough, mirrored;
 out vec4 shown;
 
 const float PI = 3.14159265358979, COS_MIN = 1e-4, ROUGHNESS_MIN = 0.045, RADIANCE_MIN = 1e-6;
@@ -61,6 +62,6 @@ void main() {
   float r2 = dot(off, off);
   float passed = exposure * exp(vignetting.x * r2 + vignetting.y * r2 * r2);
   vec3 facing = faceforward(normal, point, normal);  // the back of a sliver at a rim is no black dot
-  vec3 x = passed * radiance(normalize(facing), clamp(rough * roughness, 0.0, 1.0));
+  vec3 x = passed * (radiance(normalize(facing), clamp(rough * roughness, 0.0, 1.0)) + mirrored);
   shown = vec4(exp(gamma * log(x + RADIANCE_MIN)) - exp(gamma * log(RADIANCE_MIN)), 1.0);
 }

@@ -17,7 +17,8 @@ const SLIDERS = {
   coat_f0: ["coat f0", 0, 0.2, 0.001, look.coat_f0],
   exposure: ["exposure ×", 0.1, 4, 0.01, 1],
 };
-const state = {}, outputs = {};
+if (look.film_f0) SLIDERS.film_f0 = ["film f0", 0, 0.2, 0.001, look.film_f0];
+const state = {film_f0: 0}, outputs = {};
 const camera = {centre: [0, 0, 0], turn: [1, 0, 0, 0, 1, 0, 0, 0, 1]};  // turn: columns right, down, ahead
 let uniform = null, count = 0, playing = false;
 
@@ -76,6 +77,7 @@ function program() {
     if (!gl.getShaderParameter(shader, gl.COMPILE_STATUS)) throw Error(gl.getShaderInfoLog(shader));
   }
   gl.linkProgram(made);
+  if (!gl.getProgramParameter(made, gl.LINK_STATUS)) throw Error(gl.getProgramInfoLog(made));
   gl.useProgram(made);
   return name => gl.getUniformLocation(made, name);
 }
@@ -92,13 +94,19 @@ async function load() {
   gl.bindBuffer(gl.ARRAY_BUFFER, gl.createBuffer());
   gl.bufferData(gl.ARRAY_BUFFER, new Uint8Array(content, 0, vertices), gl.STATIC_DRAW);
   gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, gl.createBuffer());
-  gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, new Uint32Array(content, vertices), gl.STATIC_DRAW);
-  count = 3 * scene.triangles;
-  const layout = [[4, gl.UNSIGNED_SHORT, 0], [2, gl.SHORT, 8], [4, gl.UNSIGNED_BYTE, 12]];
-  layout.forEach(([parts, kind, offset], i) => {
-    gl.enableVertexAttribArray(i);
-    gl.vertexAttribPointer(i, parts, kind, true, 16, offset);
+  gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, new Uint32Array(content, vertices, 3 * scene.triangles), gl.STATIC_DRAW);
+  const layout = (stride, parts) => parts.forEach(([index, size, kind, offset]) => {
+    gl.enableVertexAttribArray(index);
+    gl.vertexAttribPointer(index, size, kind, true, stride, offset);
   });
+  layout(16, [[0, 4, gl.UNSIGNED_SHORT, 0], [1, 2, gl.SHORT, 8], [2, 4, gl.UNSIGNED_BYTE, 12]]);
+  const wet = new Uint8Array(content, vertices + 12 * scene.triangles);
+  if (wet.length) {
+    gl.bindBuffer(gl.ARRAY_BUFFER, gl.createBuffer());
+    gl.bufferData(gl.ARRAY_BUFFER, wet, gl.STATIC_DRAW);
+    layout(8, [[3, 2, gl.SHORT, 0], [4, 1, gl.FLOAT, 4]]);
+  }
+  count = 3 * scene.triangles;
   gl.enable(gl.DEPTH_TEST);
   gl.clearColor(0, 0, 0, 1);
 }
@@ -124,7 +132,7 @@ function draw() {
   gl.uniform2f(uniform("vignetting"), look.vignetting_k2, look.vignetting_k4);
   gl.uniform3fv(uniform("guides_mm"), look.guides_mm.flat());
   gl.uniform1i(uniform("guides"), look.guides_mm.length);
-  for (const name of ["n", "q", "roughness", "f0", "coat_f0", "exposure"]) set1(name, state[name]);
+  for (const name of ["n", "q", "roughness", "f0", "coat_f0", "film_f0", "exposure"]) set1(name, state[name]);
   // Another q keeps the brightness at the usual distance.
   set1("L0", look.L0 * state.intensity * look.usual_mm ** (state.q - look.q));
   set1("profile", look.profile);
@@ -132,6 +140,7 @@ function draw() {
   set1("burley", look.burley ? 1 : 0);
   set1("coat_roughness", look.coat_roughness || 0.12);
   set1("coat_tail", look.coat_tail);
+  set1("film_roughness", look.film_roughness);
   gl.drawElements(gl.TRIANGLES, count, gl.UNSIGNED_INT, 0);
 }
 

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from endotwin.errors import OutputError
 from endotwin.run import locks
-from endotwin.run.output import DATASET, IN_PYTHON, check_free, move_folder, unwritable
+from endotwin.run.output import DATASET, IN_PYTHON, check_free, move_folder, sweep, unwritable, was_replaced
 from endotwin.synth.run.shard import DATA, DONE
 
 JOB, LOCK, GOING = "job.json", "lock", "going"
@@ -45,6 +45,7 @@ class Partial:
         with self._locked():
             finished = self._just_finished(digest)
             if finished:
+                sweep(self.out.absolute().parent)
                 self.remove()
             elif self._digest() != digest:
                 self._begin(digest, overwrite)
@@ -126,7 +127,8 @@ class Partial:
 
     def _just_finished(self, digest: str) -> bool:
         """Whether the run of this job was killed after the dataset got its place."""
-        return self._digest() == digest and self.out.exists() and not self.data.exists()
+        placed = not self.data.exists() or was_replaced(self.data)
+        return self._digest() == digest and self.out.exists() and placed
 
     def _discard(self, name: str) -> None:
         entry, going = self.path / name, self.path / GOING

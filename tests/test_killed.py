@@ -1,0 +1,87 @@
+"""A kill at a change of a file, of every command that writes: old or new, and the next leaves no trace."""
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from command_line import invoke
+from faults import Killed, killed
+from test_full_disk import COMMANDS, contents
+
+from endotwin import Twin
+
+pytestmark = pytest.mark.slow
+
+MOMENTS = 4
+"""So many moments of each command are tried: the first, the last, and some between."""
+
+OVER = {
+    "align": ("aligned", "align twin -o aligned --poses poses.txt"),
+    "align in place": ("twin", "align twin --overwrite"),
+    "synth over a dataset": ("dataset", "synth twin --trajectory jitter:frames=2 -o dataset --overwrite"),
+    "export over a file": ("old.glb", "export twin old.glb --overwrite"),
+    "export of a package": ("new.usdz", "export twin new.usdz"),
+    "export of a page": ("new.html", "export twin new.html"),
+}
+LONG = {"tradeoff", "preview"}
+"""One whose commands run in processes of their own, and one that takes long to write a file as others do."""
+
+ALL = {name: each for name, each in {**COMMANDS, **OVER}.items() if name not in LONG}
+
+
+@pytest.fixture(scope="module")
+def begun(made, tmp_path_factory) -> Path:
+    """What the commands begin with."""
+    folder = tmp_path_factory.mktemp("begun")
+    for name in ("tube", "twin"):
+        shutil.copytree(made / name, folder / name)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        assert invoke("synth", "twin", "--trajectory", "jitter:frames=3", "-o", "dataset") == 0
+    (folder / "old.glb").write_bytes(b"old")
+    return folder
+
+
+def run(folder: Path, begun: Path, command: str, after: int | None) -> tuple[list[str], int | None]:
+    """The operations of a command in a fresh copy, and its exit code; None: it was killed."""
+    for entry in folder.iterdir():
+        shutil.rmtree(entry) if entry.is_dir() else entry.unlink()
+    for entry in begun.iterdir():
+        copy = shutil.copytree if entry.is_dir() else shutil.copy2
+        copy(entry, folder / entry.name)
+    with killed(folder, after) as done:
+        try:
+            return done, invoke(*command.split())
+        except Killed:
+            return done, None
+
+
+def is_new(dataset: str) -> bool:
+    """Whether its sheet tells of two frames."""
+    return json.loads(Path(dataset, "dataset.json").read_text(encoding="utf-8"))["frames"] == 2
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_a_command_that_is_killed_leaves_old_or_new_and_the_next_sweeps(begun, tmp_path, monkeypatch, name):
+    if "usdz" in ALL[name][1]:
+        pytest.importorskip("pxr")
+    target, command = ALL[name]
+    command = command.replace("read_only", "twin")
+    monkeypatch.chdir(tmp_path)
+    done, code = run(tmp_path, begun, command, None)
+    assert code == 0 and done
+    new = {entry.relative_to(tmp_path) for entry in tmp_path.rglob("*")}
+    before = contents(begun)
+    for after in np.unique(np.linspace(0, len(done) - 1, MOMENTS).astype(int)):
+        _, code = run(tmp_path, begun, command, int(after))
+        assert code is None
+        Twin.load("twin")
+        if (begun / target).is_file():
+            assert Path(target).read_bytes() == before[begun / target] or len(Path(target).read_bytes()) > 9
+        if target == "dataset":
+            assert len(list(Path(target).glob("*_color.png"))) == (2 if is_new(target) else 3)
+        again = command if "--overwrite" in command else f"{command} --overwrite"
+        assert invoke(*again.split()) == 0
+        assert {entry.relative_to(tmp_path) for entry in tmp_path.rglob("*")} == new
