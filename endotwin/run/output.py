@@ -21,7 +21,7 @@ from pathlib import Path
 from endotwin.errors import OutputError
 from endotwin.run import locks
 
-TWIN, DATASET, TRADEOFF = "twin.json", "dataset.json", "ladder.json"
+TWIN, DATASET, TRADEOFF, STUDY = "twin.json", "dataset.json", "ladder.json", "study.json"
 """Marks of the folders that endotwin writes."""
 
 HIDDEN = ".endotwin-"

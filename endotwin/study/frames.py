@@ -1,0 +1,126 @@
+"""Photos with depth of one size, from sequences and from datasets, in files that are read page by page."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from endotwin.errors import OptionError
+from endotwin.run.ahead import ahead
+from endotwin.run.threads import THREADS
+from endotwin.sequence import Sequence
+from endotwin.sequence.sequence import resized_depth
+from endotwin.study.accuracy import FARTHEST_MM
+from endotwin.study.corruptions import as_jpeg
+from endotwin.synth.encodings import UINT16
+from endotwin.synth.labels import MASK_UNSEEN
+
+COLOR, DEPTH, ASKED = "color.npy", "depth.npy", "asked.json"
+
+Size = tuple[int, int]
+"""Width and height in pixels."""
+
+
+@dataclass(frozen=True, eq=False)
+class Frames:
+    """Photos with depth.
+
+    Attributes:
+        color: uint8 [N, H, W, 3], RGB as displayed. depth_mm: float16 [N, H, W], NaN where there is none.
+    """
+
+    color: np.ndarray
+    depth_mm: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.color)
+
+    def some(self, count: int) -> Frames:
+        """``count`` of them, evenly spread; all where there are no more."""
+        if count >= len(self):
+            return self
+        chosen = np.linspace(0, len(self) - 1, count).round().astype(int)
+        return Frames(self.color[chosen], self.depth_mm[chosen])
+
+
+def joined(parts: list[Frames]) -> Frames:
+    """The frames of all parts."""
+    return Frames(
+        np.concatenate([part.color for part in parts]), np.concatenate([part.depth_mm for part in parts])
+    )
+
+
+def of_sequence(sequence: Sequence, size: Size) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Photo and depth of each frame at ``size``; no depth where the lens lets no light through."""
+    lit = sequence.lens_mask.astype(np.float32)
+    lit = cv2.resize(lit, size, interpolation=cv2.INTER_AREA) > 0.5
+
+    def read(index: int) -> tuple[np.ndarray, np.ndarray]:
+        color, depth_mm = sequence.color(index), sequence.depth_mm(index)
+        return shrunk(color, size), np.where(lit, resized_depth(depth_mm, *size), np.nan)
+
+    return ahead(read, range(len(sequence)), THREADS)
+
+
+def of_dataset(
+    folder: Path, size: Size, codec: tuple[int, int] | None = None
+) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Photo and depth of each frame of a dataset in the layout ``webdataset``, with rgb, depth and mask.
+
+    Filled-in surface has no depth, since its shape is a guess.
+
+    Args:
+        codec: least and greatest quality of a JPEG that each photo has been.
+    """
+    import webdataset
+
+    shards = sorted(str(file) for file in folder.glob("shard-*.tar"))
+    for index, frame in enumerate(webdataset.WebDataset(shards, shardshuffle=False)):
+        color = _decoded(frame["rgb.png"], cv2.IMREAD_COLOR)[..., ::-1]
+        if codec:
+            quality = np.random.default_rng(index).integers(codec[0], codec[1] + 1)
+            color = as_jpeg(color, int(quality))
+        raw = _decoded(frame["depth.tiff"], cv2.IMREAD_UNCHANGED)
+        known = (
+            (raw > 0) & (raw < UINT16) & (_decoded(frame["mask.png"], cv2.IMREAD_UNCHANGED) >= MASK_UNSEEN)
+        )
+        depth_mm = np.where(known, raw * np.float32(FARTHEST_MM / UINT16), np.nan)
+        yield shrunk(color, size), resized_depth(depth_mm, *size)
+
+
+def shrunk(color: np.ndarray, size: Size) -> np.ndarray:
+    """A photo uint8 [h, w, 3] at ``size``, each pixel the mean of what it covers."""
+    return cv2.resize(np.ascontiguousarray(color), size, interpolation=cv2.INTER_AREA)
+
+
+def _decoded(content: bytes, how: int) -> np.ndarray:
+    return cv2.imdecode(np.frombuffer(content, np.uint8), how)
+
+
+def kept(
+    frames: Iterator[tuple[np.ndarray, np.ndarray]], count: int, size: Size, folder: Path, asked: dict
+) -> Frames:
+    """The frames in the files of ``folder``, which are written unless those that were ``asked`` lie there."""
+    if not ((folder / ASKED).exists() and json.loads((folder / ASKED).read_text("utf-8")) == asked):
+        shutil.rmtree(folder, ignore_errors=True)
+        folder.mkdir(parents=True)
+        width, height = size
+        colors = np.lib.format.open_memmap(folder / COLOR, "w+", np.uint8, (count, height, width, 3))
+        depths = np.lib.format.open_memmap(folder / DEPTH, "w+", np.float16, (count, height, width))
+        for index, (color, depth_mm) in enumerate(frames):
+            colors[index], depths[index] = color, depth_mm
+        colors.flush()
+        depths.flush()
+        (folder / ASKED).write_text(json.dumps(asked), encoding="utf-8")
+    found = Frames(np.load(folder / COLOR, mmap_mode="r"), np.load(folder / DEPTH, mmap_mode="r"))
+    if not np.isfinite(found.depth_mm).any():
+        raise OptionError(
+            f"{asked['source']} has no depth within {FARTHEST_MM:g} mm in any frame; leave it out"
+        )
+    return found
