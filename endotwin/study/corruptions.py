@@ -73,8 +73,8 @@ def defocus_blur(image: np.ndarray, level: int, generator: np.random.Generator) 
     """A disc instead of each point."""
     radius, soft = ((3, 0.1), (4, 0.5), (6, 0.5), (8, 0.5), (10, 0.5))[level]
     x, y = np.meshgrid(*[np.arange(-max(radius, 8), max(radius, 8) + 1)] * 2)
-    disc = (x**2 + y**2 <= radius**2).astype(np.float32)
-    return cv2.filter2D(image, -1, cv2.GaussianBlur(disc / disc.sum(), (3, 3), soft))
+    disc = cv2.GaussianBlur((x**2 + y**2 <= radius**2).astype(np.float32), (3, 3), soft)
+    return cv2.filter2D(image, -1, disc / disc.sum())
 
 
 def glass_blur(image: np.ndarray, level: int, generator: np.random.Generator) -> np.ndarray:

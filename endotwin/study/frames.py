@@ -58,8 +58,7 @@ def joined(parts: list[Frames]) -> Frames:
 
 def of_sequence(sequence: Sequence, size: Size) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """Photo and depth of each frame at ``size``; no depth where the lens lets no light through."""
-    lit = sequence.lens_mask.astype(np.float32)
-    lit = cv2.resize(lit, size, interpolation=cv2.INTER_AREA) > 0.5
+    lit = lit_pixels(sequence, size)
 
     def read(index: int) -> tuple[np.ndarray, np.ndarray]:
         color, depth_mm = sequence.color(index), sequence.depth_mm(index)
@@ -68,14 +67,21 @@ def of_sequence(sequence: Sequence, size: Size) -> Iterator[tuple[np.ndarray, np
     return ahead(read, range(len(sequence)), THREADS)
 
 
+def lit_pixels(sequence: Sequence, size: Size) -> np.ndarray:
+    """Bool [H, W] at ``size``: not the black around the lens circle of a sequence's photos."""
+    lit = sequence.lens_mask.astype(np.float32)
+    return cv2.resize(lit, size, interpolation=cv2.INTER_AREA) > 0.5
+
+
 def of_dataset(
-    folder: Path, size: Size, codec: tuple[int, int] | None = None
+    folder: Path, size: Size, lit: np.ndarray, codec: tuple[int, int] | None = None
 ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """Photo and depth of each frame of a dataset in the layout ``webdataset``, with rgb, depth and mask.
 
     Filled-in surface has no depth, since its shape is a guess.
 
     Args:
+        lit: bool [H, W] at ``size``; the rest becomes black, and has no depth.
         codec: least and greatest quality of a JPEG that each photo has been.
     """
     import webdataset
@@ -91,7 +97,7 @@ def of_dataset(
             (raw > 0) & (raw < UINT16) & (_decoded(frame["mask.png"], cv2.IMREAD_UNCHANGED) >= MASK_UNSEEN)
         )
         depth_mm = np.where(known, raw * np.float32(FARTHEST_MM / UINT16), np.nan)
-        yield shrunk(color, size), resized_depth(depth_mm, *size)
+        yield shrunk(color, size) * lit[..., None], np.where(lit, resized_depth(depth_mm, *size), np.nan)
 
 
 def shrunk(color: np.ndarray, size: Size) -> np.ndarray:
@@ -119,7 +125,7 @@ def kept(
         depths.flush()
         (folder / ASKED).write_text(json.dumps(asked), encoding="utf-8")
     found = Frames(np.load(folder / COLOR, mmap_mode="r"), np.load(folder / DEPTH, mmap_mode="r"))
-    if not np.isfinite(found.depth_mm).any():
+    if not (found.depth_mm > 0).any():
         raise OptionError(
             f"{asked['source']} has no depth within {FARTHEST_MM:g} mm in any frame; leave it out"
         )

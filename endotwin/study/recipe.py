@@ -64,7 +64,7 @@ INGREDIENTS = (
         },
         codec=(30, 95),
     ),
-    Recipe("lens", "the lenses of the test sequences too", lenses=True),
+    Recipe("lens", "the lenses of the test sequences too, with the black around their circles", lenses=True),
 )
 
 

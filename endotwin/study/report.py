@@ -15,7 +15,7 @@ from endotwin.study import plot
 from endotwin.study.accuracy import METRICS, NAMES
 from endotwin.study.arms import HEADLINE, Arm
 from endotwin.study.corruptions import BENCHMARK
-from endotwin.study.networks import WEIGHTS
+from endotwin.study.depth_anything import WEIGHTS
 from endotwin.tradeoff.report import CSS
 
 ZERO_SHOT = Arm("zero-shot", "headline")

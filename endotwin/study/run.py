@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 
+import numpy as np
 import torch
 
 from endotwin import pipeline
@@ -22,7 +23,7 @@ from endotwin.sequence import Sequence
 from endotwin.sequence.readers import open_sequence
 from endotwin.study import judge, report
 from endotwin.study.arms import HEADLINE, Arm, arms
-from endotwin.study.frames import Frames, joined, kept, of_dataset, of_sequence
+from endotwin.study.frames import Frames, joined, kept, lit_pixels, of_dataset, of_sequence
 from endotwin.study.leak import require_unseen
 from endotwin.study.networks import found, network
 from endotwin.study.recipe import ROTATION_DEG, TRANSLATION_MM, Recipe
@@ -205,11 +206,11 @@ class _Experiment:
 
     def _rendered(self, recipe: Recipe) -> Frames:
         """The frames of a recipe: evenly from all twins, through each lens."""
-        shares = [(twin, lens) for twin in self.twins.values() for lens in self._lenses(twin, recipe)]
+        shares = [(twin, *lens) for twin in self.twins.values() for lens in self._lenses(twin, recipe)]
         vary = self.work / "recipes" / f"{recipe.name}.yaml"
         recipe.write(vary)
         parts = []
-        for number, (twin, lens) in enumerate(shares):
+        for number, (twin, lens, lit) in enumerate(shares):
             count = len(range(number, self.plan.frames, len(shares)))
             if not count:
                 continue
@@ -230,15 +231,22 @@ class _Experiment:
                     progress=lambda _, done, total: self.progress(f"render {recipe.name}", done, total),
                 )
             written = _read(data / "dataset.json")["frames"]
-            parts.append(kept(of_dataset(data, self.size, recipe.codec), written, self.size, folder, asked))
+            parts.append(
+                kept(of_dataset(data, self.size, lit, recipe.codec), written, self.size, folder, asked)
+            )
         return parts[0] if len(parts) == 1 else joined(parts)
 
-    def _lenses(self, twin: Twin, recipe: Recipe) -> list[Camera]:
-        """The twin's own lens, and where the recipe says so those of the tests, each once."""
+    def _lenses(self, twin: Twin, recipe: Recipe) -> list[tuple[Camera, np.ndarray]]:
+        """The twin's own lens, and where the recipe says so those of the tests, each once: the camera, and
+        which pixels are not black around its circle."""
         width = SUPERSAMPLING * self.size[0]
-        cameras = [twin.camera, *(test.camera for test in self.tests if recipe.lenses)]
-        scaled = [camera.scaled(min(1.0, width / camera.width)) for camera in cameras]
-        return list({json.dumps(camera.to_dict()): camera for camera in scaled}.values())
+        found = {}
+        for sequence in (twin.sequence(), *(self.tests if recipe.lenses else ())):
+            camera = sequence.camera.scaled(min(1.0, width / sequence.camera.width))
+            key = json.dumps(camera.to_dict())
+            if key not in found:
+                found[key] = camera, lit_pixels(sequence, self.size)
+        return list(found.values())
 
     # Training and judging
 

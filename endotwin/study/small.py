@@ -23,9 +23,9 @@ class Small(nn.Module):
 
     name = "small"
     size = (160, 128)
-    batch = 8
+    batch = 4
     rate = 2e-3
-    steps = 400
+    steps = 500
 
     def __init__(self) -> None:
         super().__init__()

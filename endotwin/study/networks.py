@@ -13,10 +13,8 @@ import torch
 from torch import nn
 
 from endotwin.errors import OptionError
-from endotwin.study.networks.depth_anything import WEIGHTS, DepthAnything
-from endotwin.study.networks.small import Small
-
-__all__ = ["WEIGHTS", "found", "network"]
+from endotwin.study.depth_anything import WEIGHTS, DepthAnything
+from endotwin.study.small import Small
 
 logger = logging.getLogger("endotwin")
 

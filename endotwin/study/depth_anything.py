@@ -57,7 +57,7 @@ class DepthAnything(nn.Module):
             config = AutoConfig.from_pretrained(place, local_files_only=True)
             self.relative = getattr(config, "depth_estimation_type", None) != "metric" and not adapted
             if not self.relative:
-                config.depth_estimation_type, config.max_depth = "metric", FARTHEST_MM
+                config.depth_estimation_type, config.max_depth = "metric", int(FARTHEST_MM)
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
                 model = DepthAnythingForDepthEstimation.from_pretrained(
