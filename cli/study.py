@@ -10,12 +10,15 @@ from endotwin.cli import console
 
 from endotwin.run.output import STUDY, check_apart, check_free
 
-study = typer.Typer(no_args_is_help=True, help="Measure what datasets rendered from a twin are worth.")
+study = typer.Typer(no_args_is_help=True)
 
 
 @study.callback()
 def describe() -> None:
-    """Measure what datasets rendered from a twin are worth."""
+    """Measure what datasets rendered from a twin are worth.
+
+    Example: endotwin study depth --real cecum --twin twin --test sigmoid --test rectum -o study
+    """
 
 
 @study.command("depth")
