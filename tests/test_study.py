@@ -198,8 +198,9 @@ def test_kept_frames_are_read_again_unless_something_else_is_asked(other, tmp_pa
     assert frames.color.shape == (3, 16, 20, 3) and frames.depth_mm.shape == (3, 16, 20)
     again = kept(iter(()), 3, size, tmp_path / "f", {"source": "a"})
     assert np.array_equal(again.color, frames.color)
-    with pytest.raises(OptionError, match="no depth"):
-        kept(iter(()), 3, size, tmp_path / "f", {"source": "b"})
+    blind = [(color, np.full_like(depth_mm, np.nan)) for color, depth_mm in (frames[0], frames[1])]
+    with pytest.raises(OptionError, match="b has no depth"):
+        kept(iter(blind), 2, size, tmp_path / "f", {"source": "b"})
     assert len(frames.some(2)) == 2 and len(frames.some(9)) == 3
 
 

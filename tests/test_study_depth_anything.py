@@ -48,7 +48,7 @@ def pool(weights):
     width, height = DepthAnything(weights, adapted=True).size
     generator = np.random.default_rng(0)
     color = generator.integers(0, 255, (4, height, width, 3)).astype(np.uint8)
-    return Frames(color, np.full((4, height, width), 40, np.float16))
+    return Frames(color, np.full((4, height, width), 40, np.float16), np.arange(4))
 
 
 def test_lora_is_on_every_layer_of_attention_and_mlp_and_the_head_is_trained_whole(weights):

@@ -28,7 +28,7 @@ def frames(count: int, color: int = 90, depth_mm: float = 30.0) -> Frames:
     noise = generator.integers(-40, 40, (count, 32, 40, 3))
     depths = depth_mm + generator.uniform(-5, 5, (count, 32, 40))
     depths[:, :4] = np.nan
-    return Frames((color + noise).astype(np.uint8), depths.astype(np.float16))
+    return Frames((color + noise).astype(np.uint8), depths.astype(np.float16), np.arange(count))
 
 
 def test_huber_is_quadratic_below_five_millimetres_and_linear_beyond():
@@ -56,7 +56,7 @@ def test_each_pool_gives_as_many_photos():
 def test_flips_move_photo_and_depth_alike():
     depth_mm = np.arange(32 * 40, dtype=np.float32).reshape(1, 32, 40) / 20
     color = np.repeat((depth_mm * 3)[..., None], 3, axis=3).astype(np.uint8)
-    pool = Frames(color, depth_mm.astype(np.float16))
+    pool = Frames(color, depth_mm.astype(np.float16), np.arange(1))
     seen = set()
     for step in range(20):
         photos, depths = batch([pool], COURSE, step)

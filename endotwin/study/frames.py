@@ -5,8 +5,9 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import BinaryIO
 
 import cv2
 import numpy as np
@@ -26,6 +27,9 @@ COLOR, DEPTH, ASKED = "color.npy", "depth.npy", "asked.json"
 Size = tuple[int, int]
 """Width and height in pixels."""
 
+Frame = tuple[np.ndarray, np.ndarray]
+"""A photo uint8 [H, W, 3], and its depth [H, W] in mm, NaN where there is none."""
+
 
 @dataclass(frozen=True, eq=False)
 class Frames:
@@ -33,34 +37,32 @@ class Frames:
 
     Attributes:
         color: uint8 [N, H, W, 3], RGB as displayed. depth_mm: float16 [N, H, W], NaN where there is none.
+        chosen: int [M], the frames that count.
     """
 
     color: np.ndarray
     depth_mm: np.ndarray
+    chosen: np.ndarray
 
     def __len__(self) -> int:
-        return len(self.color)
+        return len(self.chosen)
+
+    def __getitem__(self, index: int) -> Frame:
+        """One frame, its depth as float32."""
+        number = self.chosen[index]
+        return self.color[number], self.depth_mm[number].astype(np.float32)
 
     def some(self, count: int) -> Frames:
         """``count`` of them, evenly spread; all where there are no more."""
-        if count >= len(self):
-            return self
-        chosen = np.linspace(0, len(self) - 1, count).round().astype(int)
-        return Frames(self.color[chosen], self.depth_mm[chosen])
+        spread = np.linspace(0, len(self) - 1, min(count, len(self))).round().astype(int)
+        return replace(self, chosen=self.chosen[spread])
 
 
-def joined(parts: list[Frames]) -> Frames:
-    """The frames of all parts."""
-    return Frames(
-        np.concatenate([part.color for part in parts]), np.concatenate([part.depth_mm for part in parts])
-    )
-
-
-def of_sequence(sequence: Sequence, size: Size) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+def of_sequence(sequence: Sequence, size: Size) -> Iterator[Frame]:
     """Photo and depth of each frame at ``size``; no depth where the lens lets no light through."""
     lit = lit_pixels(sequence, size)
 
-    def read(index: int) -> tuple[np.ndarray, np.ndarray]:
+    def read(index: int) -> Frame:
         color, depth_mm = sequence.color(index), sequence.depth_mm(index)
         return shrunk(color, size), np.where(lit, resized_depth(depth_mm, *size), np.nan)
 
@@ -75,7 +77,7 @@ def lit_pixels(sequence: Sequence, size: Size) -> np.ndarray:
 
 def of_dataset(
     folder: Path, size: Size, lit: np.ndarray, codec: tuple[int, int] | None = None
-) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+) -> Iterator[Frame]:
     """Photo and depth of each frame of a dataset in the layout ``webdataset``, with rgb, depth and mask.
 
     Filled-in surface has no depth, since its shape is a guess.
@@ -109,24 +111,26 @@ def _decoded(content: bytes, how: int) -> np.ndarray:
     return cv2.imdecode(np.frombuffer(content, np.uint8), how)
 
 
-def kept(
-    frames: Iterator[tuple[np.ndarray, np.ndarray]], count: int, size: Size, folder: Path, asked: dict
-) -> Frames:
-    """The frames in the files of ``folder``, which are written unless those that were ``asked`` lie there."""
+def kept(frames: Iterator[Frame], count: int, size: Size, folder: Path, asked: dict) -> Frames:
+    """``count`` frames in the files of ``folder``, written unless those that were ``asked`` lie there."""
     if not ((folder / ASKED).exists() and json.loads((folder / ASKED).read_text("utf-8")) == asked):
         shutil.rmtree(folder, ignore_errors=True)
         folder.mkdir(parents=True)
-        width, height = size
-        colors = np.lib.format.open_memmap(folder / COLOR, "w+", np.uint8, (count, height, width, 3))
-        depths = np.lib.format.open_memmap(folder / DEPTH, "w+", np.float16, (count, height, width))
-        for index, (color, depth_mm) in enumerate(frames):
-            colors[index], depths[index] = color, depth_mm
-        colors.flush()
-        depths.flush()
+        shape = (count, size[1], size[0])
+        with (folder / COLOR).open("wb") as colors, (folder / DEPTH).open("wb") as depths:
+            _begin(colors, np.uint8, (*shape, 3))
+            _begin(depths, np.float16, shape)
+            for color, depth_mm in frames:
+                colors.write(color.astype(np.uint8).tobytes())
+                depths.write(depth_mm.astype(np.float16).tobytes())
         (folder / ASKED).write_text(json.dumps(asked), encoding="utf-8")
-    found = Frames(np.load(folder / COLOR, mmap_mode="r"), np.load(folder / DEPTH, mmap_mode="r"))
-    if not (found.depth_mm > 0).any():
-        raise OptionError(
-            f"{asked['source']} has no depth within {FARTHEST_MM:g} mm in any frame; leave it out"
-        )
-    return found
+    color, depth_mm = (np.load(folder / name, mmap_mode="r") for name in (COLOR, DEPTH))
+    if not (depth_mm > 0).any():
+        raise OptionError(f"{asked['source']} has no depth within {FARTHEST_MM:g} mm; leave it out")
+    return Frames(color, depth_mm, np.arange(count))
+
+
+def _begin(file: BinaryIO, kind: type, shape: tuple[int, ...]) -> None:
+    """The header of a NumPy file: what follows is written frame by frame, so that a full disk is an error."""
+    header = {"descr": np.lib.format.dtype_to_descr(np.dtype(kind)), "fortran_order": False, "shape": shape}
+    np.lib.format.write_array_header_1_0(file, header)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
+from itertools import islice
 
 import numpy as np
 import torch
@@ -11,7 +12,7 @@ from torch import nn
 from endotwin.sequence.sequence import resized_depth
 from endotwin.study.accuracy import METRICS, accuracy, error_by_depth, median_scaled
 from endotwin.study.corruptions import CORRUPTIONS, SEVERITIES, corrupted
-from endotwin.study.frames import Frames, Size, shrunk
+from endotwin.study.frames import Frame, Frames, Size, shrunk
 from endotwin.study.train import predicted
 
 BATCH = 8
@@ -29,7 +30,7 @@ def judged(network: nn.Module, test: Frames, device: torch.device) -> dict:
         "images": number}``
     """
     metric, scaled, sums = [], [], 0.0
-    for depth_mm, found_mm in _predictions(network, test.color, test, device):
+    for depth_mm, found_mm in _predictions(network, test, device):
         metric.append(accuracy(depth_mm, found_mm))
         scaled.append(accuracy(depth_mm, median_scaled(depth_mm, found_mm)))
         sums = sums + error_by_depth(depth_mm, found_mm)
@@ -53,39 +54,29 @@ def judged_corrupted(networks: dict[str, nn.Module], test: Frames, size: Size, d
         ``{network: {corruption: [mean over the images, one a severity]}}``, and ``clean`` beside them.
     """
     found: dict[str, dict[str, list[float]]] = {name: {} for name in networks}
-    few = test.some(CORRUPTED_FRAMES)
-    kinds = [("clean", (0,)), *((name, SEVERITIES) for name in CORRUPTIONS)]
-    small_depth = Frames(few.color, _at(few.depth_mm, size))
-    for kind, severities in kinds:
+    frames = [test.some(CORRUPTED_FRAMES)[index] for index in range(min(CORRUPTED_FRAMES, len(test)))]
+    depths = [resized_depth(depth_mm, *size) for _, depth_mm in frames]
+    for kind, severities in (("clean", (0,)), *((name, SEVERITIES) for name in CORRUPTIONS)):
         for severity in severities:
             photos = [
                 shrunk(photo if kind == "clean" else corrupted(photo, kind, severity, index), size)
-                for index, photo in enumerate(few.color)
+                for index, (photo, _) in enumerate(frames)
             ]
             for name, network in networks.items():
                 scores = [
                     accuracy(depth_mm, median_scaled(depth_mm, found_mm))["abs_rel"]
-                    for depth_mm, found_mm in _predictions(network, np.stack(photos), small_depth, device)
+                    for depth_mm, found_mm in _predictions(network, zip(photos, depths, strict=True), device)
                 ]
-                found[name].setdefault(kind, []).append(float(np.nanmean(scores)))
+                found[name].setdefault(kind, []).append(float(np.mean(scores)))
     return found
 
 
-def _at(depth_mm: np.ndarray, size: Size) -> np.ndarray:
-    """Depth maps [N, h, w] at ``size``."""
-    return np.stack([resized_depth(each.astype(np.float32), *size) for each in depth_mm])
-
-
-def _predictions(
-    network: nn.Module, color: np.ndarray, test: Frames, device: torch.device
-) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Depth and prediction of each frame that has depth."""
-    for first in range(0, len(color), BATCH):
-        found = predicted(network, np.asarray(color[first : first + BATCH]), device)
-        for index, found_mm in enumerate(found, first):
-            depth_mm = test.depth_mm[index].astype(np.float32)
-            if np.isfinite(depth_mm).any():
-                yield depth_mm, found_mm
+def _predictions(network: nn.Module, frames: Iterable[Frame], device: torch.device) -> Iterator[Frame]:
+    """Depth and prediction, both [H, W] in mm, of each frame that has depth."""
+    known = (frame for frame in frames if np.isfinite(frame[1]).any())
+    while some := list(islice(known, BATCH)):
+        found = predicted(network, np.stack([color for color, _ in some]), device)
+        yield from zip((depth_mm for _, depth_mm in some), found, strict=True)
 
 
 def _means(scores: list[dict[str, float]]) -> dict[str, float]:

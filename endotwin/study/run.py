@@ -9,6 +9,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from importlib.util import find_spec
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -17,13 +18,13 @@ import torch
 from endotwin import pipeline
 from endotwin.cameras import Camera
 from endotwin.errors import OptionError, OutputError
-from endotwin.run.output import STUDY, check_apart, check_free, move_folder, unwritable, whole_file
+from endotwin.run.output import DATASET, STUDY, check_apart, check_free, move_folder, unwritable, whole_file
 from endotwin.run.threads import device_of
 from endotwin.sequence import Sequence
 from endotwin.sequence.readers import open_sequence
 from endotwin.study import judge, report
 from endotwin.study.arms import HEADLINE, Arm, arms
-from endotwin.study.frames import Frames, joined, kept, lit_pixels, of_dataset, of_sequence
+from endotwin.study.frames import Frames, kept, lit_pixels, of_dataset, of_sequence
 from endotwin.study.leak import require_unseen
 from endotwin.study.networks import found, network
 from endotwin.study.recipe import ROTATION_DEG, TRANSLATION_MM, Recipe
@@ -187,13 +188,9 @@ class _Experiment:
 
     def _sequences(self, name: str, sequences: list[Sequence], size: tuple[int, int]) -> Frames:
         """Frames of sequences at ``size``."""
-        parts = []
-        for number, sequence in enumerate(sequences):
-            self.progress(f"read {sequence.path.name}", number, len(sequences))
-            folder = self.work / "frames" / f"{name}-{number}"
-            asked = {"source": str(sequence.path.resolve()), "size": list(size)}
-            parts.append(kept(of_sequence(sequence, size), len(sequence), size, folder, asked))
-        return parts[0] if len(parts) == 1 else joined(parts)
+        frames = chain.from_iterable(of_sequence(sequence, size) for sequence in sequences)
+        asked = {"source": ", ".join(str(sequence.path) for sequence in sequences), "size": list(size)}
+        return kept(frames, sum(map(len, sequences)), size, self.work / "frames" / name, asked)
 
     def _pool(self, name: str) -> Frames:
         if name not in self._pools:
@@ -207,34 +204,32 @@ class _Experiment:
     def _rendered(self, recipe: Recipe) -> Frames:
         """The frames of a recipe: evenly from all twins, through each lens."""
         shares = [(twin, *lens) for twin in self.twins.values() for lens in self._lenses(twin, recipe)]
-        vary = self.work / "recipes" / f"{recipe.name}.yaml"
-        recipe.write(vary)
-        parts = []
+        recipe.write(self.work / "recipes" / f"{recipe.name}.yaml")
+        parts, count = [], 0
         for number, (twin, lens, lit) in enumerate(shares):
-            count = len(range(number, self.plan.frames, len(shares)))
-            if not count:
-                continue
-            name = f"{recipe.name}-{number}"
-            lens_file = self.work / "recipes" / f"{name}.camera.json"
+            if wanted := len(range(number, self.plan.frames, len(shares))):
+                data = self._dataset(recipe, f"{recipe.name}-{number}", twin, lens, wanted)
+                parts.append(of_dataset(data, self.size, lit, recipe.codec))
+                count += _read(data / DATASET)["frames"]
+        folder = self.work / "frames" / recipe.name
+        return kept(chain(*parts), count, self.size, folder, {"source": recipe.name, "size": list(self.size)})
+
+    def _dataset(self, recipe: Recipe, name: str, twin: Twin, lens: Camera, count: int) -> Path:
+        """The dataset ``name`` of so many poses, rendered unless it is there."""
+        data, lens_file = self.work / "datasets" / name, self.work / "recipes" / f"{name}.camera.json"
+        if not data.exists():
             _keep(lens.to_dict(), lens_file)
-            data, folder = self.work / "datasets" / name, self.work / "frames" / name
-            asked = {"source": name, "size": list(self.size)}
-            if not data.exists():
-                pipeline.synthesize(
-                    twin,
-                    f"jitter:frames={count},translation={TRANSLATION_MM},rotation={ROTATION_DEG}",
-                    data,
-                    vary=vary,
-                    camera=lens_file,
-                    labels="rgb,depth,mask",
-                    layout="webdataset",
-                    progress=lambda _, done, total: self.progress(f"render {recipe.name}", done, total),
-                )
-            written = _read(data / "dataset.json")["frames"]
-            parts.append(
-                kept(of_dataset(data, self.size, lit, recipe.codec), written, self.size, folder, asked)
+            pipeline.synthesize(
+                twin,
+                f"jitter:frames={count},translation={TRANSLATION_MM},rotation={ROTATION_DEG}",
+                data,
+                vary=self.work / "recipes" / f"{recipe.name}.yaml",
+                camera=lens_file,
+                labels="rgb,depth,mask",
+                layout="webdataset",
+                progress=lambda _, done, total: self.progress(f"render {recipe.name}", done, total),
             )
-        return parts[0] if len(parts) == 1 else joined(parts)
+        return data
 
     def _lenses(self, twin: Twin, recipe: Recipe) -> list[tuple[Camera, np.ndarray]]:
         """The twin's own lens, and where the recipe says so those of the tests, each once: the camera, and

@@ -118,9 +118,10 @@ def batch(pools: list[Frames], course: Course, step: int) -> tuple[torch.Tensor,
         pool = pools[(place + step) % len(pools)]
         index = int(generator.integers(len(pool)))
         across, down = (slice(None, None, -1 if flip else 1) for flip in generator.random(2) < 0.5)
-        colors.append(pool.color[index][down, across])
-        depths.append(pool.depth_mm[index][down, across])
-    return as_tensor(np.stack(colors)), torch.from_numpy(np.stack(depths).astype(np.float32))
+        color, depth_mm = pool[index]
+        colors.append(color[down, across])
+        depths.append(depth_mm[down, across])
+    return as_tensor(np.stack(colors)), torch.from_numpy(np.stack(depths))
 
 
 def as_tensor(color: np.ndarray) -> torch.Tensor:
