@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from endotwin.errors import OptionError
-from endotwin.study.recipe import INGREDIENTS, POSES, RENDERED, Recipe, merged
+from endotwin.study.recipe import EVERYTHING, INGREDIENTS, POSES, RENDERED, Recipe, merged
 
 PARTS = ("headline", "ingredients", "curve", "robustness")
 CURVE = (50, 100, 200, 500, 1000, 2000, 5000)
@@ -38,10 +38,8 @@ HEADLINE = (
     Arm("rendered", "headline", recipe=RENDERED),
     Arm("both", "headline", real=True, recipe=RENDERED),
 )
-TASTED = tuple(
-    Arm(recipe.name, "ingredients", recipe=recipe)
-    for recipe in (POSES, *(merged(f"poses+{each.name}", (each,)) for each in INGREDIENTS))
-)
+VARIED = tuple(merged(f"poses+{each.name}", (POSES, each)) for each in INGREDIENTS)
+TASTED = tuple(Arm(recipe.name, "ingredients", recipe=recipe) for recipe in (POSES, *VARIED, EVERYTHING))
 
 
 def arms(parts: tuple[str, ...], frames: int) -> list[Arm]:

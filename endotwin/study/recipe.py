@@ -64,7 +64,6 @@ INGREDIENTS = (
         },
         codec=(30, 95),
     ),
-    Recipe("lens", "the lenses of the test sequences too, with the black around their circles", lenses=True),
 )
 
 
@@ -82,5 +81,11 @@ def merged(name: str, recipes: tuple[Recipe, ...]) -> Recipe:
     return Recipe(name, words, vary, codec, any(recipe.lenses for recipe in recipes))
 
 
-RENDERED = merged("rendered", INGREDIENTS)
-"""Everything: the arm that stands for endotwin's datasets."""
+RENDERED = Recipe(
+    "rendered",
+    "novel poses, through the lenses of the test sequences too, with the black around their circles",
+    lenses=True,
+)
+"""What stands for endotwin's datasets: what helped (docs/study.md)."""
+
+EVERYTHING = merged("everything", (RENDERED, *INGREDIENTS))
