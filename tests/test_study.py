@@ -23,7 +23,7 @@ from endotwin.study.arms import HEADLINE, TASTED, arms
 from endotwin.study.corruptions import CORRUPTIONS
 from endotwin.study.frames import kept, of_dataset, of_sequence
 from endotwin.study.leak import LeakError, require_unseen
-from endotwin.study.recipe import INGREDIENTS, RENDERED, merged
+from endotwin.study.recipe import EVERYTHING, INGREDIENTS, RENDERED
 from endotwin.study.run import Plan
 from endotwin.synth import read_variation
 from endotwin.synth.variation import Variation
@@ -94,7 +94,7 @@ def test_a_stopped_study_goes_on_to_the_same_numbers_and_more_parts_go_on_from_t
     assert whole == parted
     trained.clear()
     assert study("-o", tmp_path / "parted", "--parts", "ingredients", "--overwrite")[0] == 0
-    assert any(label.startswith("poses+lens") for label in trained)
+    assert any(label.startswith("everything") for label in trained)
     assert not any(label.startswith("both") for label in trained)
     assert parted.splitlines()[:7] == (tmp_path / "parted" / "depth.csv").read_text().splitlines()[:7]
 
@@ -206,17 +206,14 @@ def test_kept_frames_are_read_again_unless_something_else_is_asked(other, tmp_pa
 
 def test_recipes_are_ranges_that_synth_understands_and_all_has_every_one(made, tmp_path):
     twin = Twin.load(made / "twin")
-    for recipe in (*INGREDIENTS, RENDERED):
+    for recipe in (*INGREDIENTS, RENDERED, EVERYTHING):
         recipe.write(tmp_path / "vary.yaml")
         drawn = read_variation(tmp_path / "vary.yaml", twin, Variation()).to_dict()
         for key, values in recipe.vary.items():
             assert len(drawn[key]) == len(values)
-    assert (
-        RENDERED.lenses
-        and RENDERED.codec
-        and set(RENDERED.vary) == {key for recipe in INGREDIENTS for key in recipe.vary}
-    )
-    assert merged("one", INGREDIENTS[:1]).vary == INGREDIENTS[0].vary
+    assert RENDERED.lenses and EVERYTHING.lenses and EVERYTHING.codec
+    for key in ("material", "light", "response", "parameters"):
+        assert EVERYTHING.vary[key] == [each for recipe in INGREDIENTS for each in recipe.vary.get(key, [])]
 
 
 def test_arms_of_the_curve_have_fewer_frames_than_there_are():
