@@ -3,7 +3,9 @@
 import numpy as np
 import pytest
 import torch
+import tube_sequence
 
+from endotwin.study import Plan, study_depth
 from endotwin.study.depth_anything import DepthAnything
 from endotwin.study.frames import Frames
 from endotwin.study.networks import network
@@ -99,3 +101,13 @@ def test_relative_weights_without_training_give_the_inverse_of_disparity(weights
     with torch.inference_mode():
         disparity = plain.model(pixel_values=(photos - plain.mean) / plain.deviation).predicted_depth
         assert torch.allclose(plain(photos), 1 / disparity.clamp(min=1e-3), rtol=1e-4)
+
+
+def test_a_study_with_weights_has_a_row_for_the_network_as_published(weights, made, tmp_path):
+    test = tube_sequence.write(tmp_path / "test", 2, 40, 30)
+    plan = Plan(network=str(weights), frames=2, steps=1, seeds=1)
+    findings = study_depth([made / "tube"], [made / "twin"], [test], tmp_path / "s", plan)
+    assert [arm.name for arm in findings.arms] == ["zero-shot", "real", "rendered", "both"]
+    rows = (tmp_path / "s" / "depth.csv").read_text(encoding="utf-8").splitlines()
+    assert sum(",zero-shot," in row for row in rows) == 2 and len(rows) == 9
+    assert "as they are" in (tmp_path / "s" / "depth.html").read_text(encoding="utf-8")

@@ -156,6 +156,7 @@ class _Experiment:
             raise
         findings = report.Findings.read(self.work, self.arms, self.plan.seeds, self._facts(started))
         report.write(findings, self.work)
+        self._pools.clear()  # which hold files open
         for name in ("datasets", "frames"):
             shutil.rmtree(self.work / name, ignore_errors=True)
         move_folder(self.work, self.out, lambda name: name.parts[0].partition(".")[0] in OWN)
