@@ -86,13 +86,15 @@ def _cells(findings: Findings, arm: Arm, test: int) -> list[str]:
 
 
 def _spread(values: np.ndarray) -> str:
-    digits = 2 if values.mean() >= 1 else 3
+    digits = 2 if values.mean() > 1 else 3
     return f"{values.mean():.{digits}f}" + (f"±{values.std(ddof=1):.{digits}f}" if len(values) > 1 else "")
 
 
 def answer(findings: Findings) -> str:
     """In a sentence a test: how rendered frames compare with real ones, and both with either."""
-    return " ".join(_answer(findings, test, name) for test, name in enumerate(findings.facts["tests"]))
+    said = [_answer(findings, test, name) for test, name in enumerate(findings.facts["tests"])]
+    chance = ["Of one seed: any difference may be chance."] if findings.facts["seeds"] == 1 else []
+    return " ".join([*said, *chance])
 
 
 def _answer(findings: Findings, test: int, name: str) -> str:
