@@ -42,14 +42,18 @@ class Findings:
     def read(cls, work: Path, arms: list[Arm], seeds: int, facts: dict) -> Findings:
         """The results that lie in ``work``."""
         results = work / "results"
-        runs = {
-            arm.name: [_read(results / f"{arm.name}.{seed}.json")["scores"] for seed in range(seeds)]
+        if (results / "zero-shot.0.json").exists():
+            arms = [ZERO_SHOT, *arms]
+        found = {
+            arm.name: [
+                _read(results / f"{arm.name}.{seed}.json") for seed in range(1 if arm is ZERO_SHOT else seeds)
+            ]
             for arm in arms
         }
-        if (results / "zero-shot.0.json").exists():
-            runs["zero-shot"] = [_read(results / "zero-shot.0.json")["scores"]]
-            arms = [ZERO_SHOT, *arms]
+        runs = {name: [result["scores"] for result in each] for name, each in found.items()}
+        seconds = sum(result["seconds"] for each in found.values() for result in each)
         robustness = [_read(file) for file in sorted(results.glob("robustness.*.json"))]
+        facts = {**facts, "seconds": seconds}
         return cls(facts, arms, runs, robustness)
 
     def values(self, arm: str, test: int, metric: str, kind: str = "metric") -> np.ndarray:
@@ -156,7 +160,7 @@ def _protocol(facts: dict) -> str:
         f"{facts['loss']}, {facts['seeds']} seeds. {frames['real']} real frames of "
         f"{', '.join(facts['real'])}; {frames['rendered']} frames rendered from "
         f"{', '.join(facts['twins'])} at new poses ({facts['trajectory']}). {facts['machine']}, "
-        f"{facts['seconds'] / 60:.0f} minutes."
+        f"{facts['seconds'] / 60:.0f} minutes of rendering, training and judging."
     )
 
 

@@ -142,7 +142,6 @@ class _Experiment:
 
     def run(self) -> report.Findings:
         self._enter()
-        started = time.monotonic()
         try:
             for number, arm in enumerate(self.arms):
                 for seed in range(self.plan.seeds):
@@ -154,7 +153,7 @@ class _Experiment:
         except BaseException as stopped:
             stopped.add_note(f"the same command goes on from {self.work}")
             raise
-        findings = report.Findings.read(self.work, self.arms, self.plan.seeds, self._facts(started))
+        findings = report.Findings.read(self.work, self.arms, self.plan.seeds, self._facts())
         report.write(findings, self.work)
         self._pools.clear()  # which hold files open
         for name in ("datasets", "frames"):
@@ -297,7 +296,7 @@ class _Experiment:
                 frames = self._sequences(f"large-{number}", [test], large)
                 _keep(judge.judged_corrupted(networks, frames, self.size, self.device), result)
 
-    def _facts(self, started: float) -> dict:
+    def _facts(self) -> dict:
         """What the page says beside the numbers."""
         width, height = self.size
         return {
@@ -316,7 +315,6 @@ class _Experiment:
             "trajectory": f"jitter:translation={TRANSLATION_MM},rotation={ROTATION_DEG}",
             "unseen": self.unseen,
             "machine": machine(),
-            "seconds": time.monotonic() - started,
         }
 
 
