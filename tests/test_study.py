@@ -15,7 +15,7 @@ from command_line import invoke
 from endotwin.cli import console
 
 import endotwin
-from endotwin.errors import OptionError
+from endotwin.errors import OptionError, TwinError
 from endotwin.sequence.readers import open_sequence
 from endotwin.study import parse_parts, study_depth
 from endotwin.study.accuracy import METRICS
@@ -169,7 +169,7 @@ def test_what_makes_no_sense_is_refused_in_one_line_and_nothing_is_left(study, t
 
 def test_a_twin_that_is_not_fitted_is_refused(made, other, tmp_path):
     endotwin.fuse_twin(made / "tube").save(tmp_path / "fused")
-    with pytest.raises(OptionError, match="endotwin fit"):
+    with pytest.raises(TwinError, match="endotwin fit"):
         study_depth([made / "tube"], [tmp_path / "fused"], [other], tmp_path / "s", Plan(network="small"))
 
 

@@ -17,7 +17,7 @@ import torch
 
 from endotwin import pipeline
 from endotwin.cameras import Camera
-from endotwin.errors import OptionError, OutputError
+from endotwin.errors import OptionError, OutputError, TwinError
 from endotwin.run.output import DATASET, STUDY, check_apart, check_free, move_folder, unwritable, whole_file
 from endotwin.run.threads import device_of
 from endotwin.sequence import Sequence
@@ -327,7 +327,7 @@ def _names(sequences: list[Sequence]) -> list[str]:
 def _fitted(folder: Path) -> Twin:
     twin = Twin.load(Path(folder))
     if not twin.fitted:
-        raise OptionError(f"{folder} has no materials yet; run 'endotwin fit {folder}' first")
+        raise TwinError(f"{folder} has no materials yet; run 'endotwin fit {folder}' first")
     return twin
 
 
