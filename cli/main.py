@@ -17,6 +17,7 @@ from endotwin.cli.inspect import inspect
 from endotwin.cli.plain import spell_out
 from endotwin.cli.selfcheck import selfcheck
 from endotwin.cli.stop import Stopped, heed_signals, tell
+from endotwin.cli.study import study
 from endotwin.cli.synth import synth
 from endotwin.cli.tradeoff import tradeoff
 
@@ -42,6 +43,7 @@ for name, function in {
     "tradeoff": tradeoff,
 }.items():
     app.command(name)(function)
+app.add_typer(study, name="study")
 
 (USAGE_ERRORS,) = typer.BadParameter.__bases__
 """Of any option: unknown, missing, of a wrong type or out of its range."""

@@ -172,12 +172,14 @@ def test_help_is_instant_because_nothing_slow_is_imported():
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, encoding="utf-8")
     assert done.returncode == 0, done.stderr
-    assert all(command in done.stdout for command in ("fuse", "fit", "eval", "synth", "tradeoff"))
+    assert all(command in done.stdout for command in ("fuse", "fit", "eval", "synth", "tradeoff", "study"))
 
 
-@pytest.mark.parametrize("command", ["fuse", "fit", "eval", "synth", "inspect", "export", "tradeoff"])
+@pytest.mark.parametrize(
+    "command", ["fuse", "fit", "eval", "synth", "inspect", "export", "tradeoff", "study", "study depth"]
+)
 def test_every_command_explains_itself_with_an_example(endotwin, command):
-    code, out, _ = endotwin(command, "--help")
+    code, out, _ = endotwin(*command.split(), "--help")
     assert code == 0 and f"endotwin {command}" in out and "Example" in out
 
 

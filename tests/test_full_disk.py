@@ -4,6 +4,7 @@ import shutil
 from pathlib import Path
 
 import pytest
+import tube_sequence
 from command_line import invoke
 from faults import full_disk
 
@@ -25,6 +26,7 @@ COMMANDS = {
     "export of several": ("new", "export twin new.obj"),
     "export of a folder": ("new.mitsuba", "export twin new.mitsuba"),
     "tradeoff": ("new", "tradeoff tube -o new --rungs draft --repeats 1"),
+    "study": ("new", "study depth --real tube --twin twin --test other -o new --network small"),
 }
 
 
@@ -33,6 +35,7 @@ def here(made, tmp_path, monkeypatch) -> Path:
     """A copy of them to stand in."""
     for name in ("tube", "twin"):
         shutil.copytree(made / name, tmp_path / name)
+    tube_sequence.write(tmp_path / "other", 1, 40, 30)
     monkeypatch.chdir(tmp_path)
     return tmp_path
 
@@ -56,5 +59,5 @@ def test_a_command_that_meets_a_full_disk_says_so_and_changes_nothing(here, capf
     assert (
         said.startswith("error: ") and f"{file}" in said and "the disk is full" in said and "MB free" in said
     )
-    kept = here / "new.partial" if name == "tradeoff" else None  # the same command goes on from there
+    kept = here / "new.partial" if name in ("tradeoff", "study") else None  # whence the same command goes on
     assert {entry: content for entry, content in contents(here).items() if entry != kept} == before

@@ -56,7 +56,7 @@ def test_a_sequence_becomes_a_twin_and_a_dataset_without_posix(tmp_path):
     assert sorted(path.name for path in tmp_path.glob(".endotwin-*")) == [".endotwin-at-work"]
 
 
-@pytest.mark.parametrize("command", ["fuse", "fit", "eval", "synth", "inspect", "check", "tradeoff"])
+@pytest.mark.parametrize("command", ["fuse", "fit", "eval", "synth", "inspect", "check", "tradeoff", "study"])
 def test_every_command_starts_without_posix(command):
     assert endotwin(command, "--help").returncode == 0
 

@@ -22,7 +22,7 @@ from endotwin.errors import OutputError
 from endotwin.run import locks
 from endotwin.run.exchange import exchanged
 
-TWIN, DATASET, TRADEOFF = "twin.json", "dataset.json", "ladder.json"
+TWIN, DATASET, TRADEOFF, STUDY = "twin.json", "dataset.json", "ladder.json", "study.json"
 """Marks of the folders that endotwin writes."""
 
 HIDDEN = ".endotwin-"

@@ -1,0 +1,50 @@
+"""Depth networks: modules that take photos [B, 3, H, W] in [0, 1] to depth in mm [B, H, W].
+
+Each has a ``name``, the ``size`` (width, height) of its images, the ``batch`` and the ``rate`` that it is
+trained with, and ``steps``, or ``epochs`` of the rendered frames.
+"""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+
+import torch
+from torch import nn
+
+from endotwin.errors import OptionError
+from endotwin.study.depth_anything import WEIGHTS, DepthAnything
+from endotwin.study.small import Small
+
+logger = logging.getLogger("endotwin")
+
+
+def found(asked: str) -> str:
+    """The network that ``asked`` names: ``small``, or the place of Depth Anything's weights.
+
+    ``auto`` is Depth Anything where the cache of Hugging Face holds it, else the small network, with a word.
+    """
+    if asked != "auto":
+        return asked
+    try:
+        DepthAnything(WEIGHTS, adapted=False)
+    except OptionError:
+        logger.warning("no weights of %s are on this machine: the small network runs", WEIGHTS)
+        return "small"
+    return WEIGHTS
+
+
+def network(name: str, seed: int, adapted: bool = True) -> nn.Module:
+    """The network ``name``, as ``found`` gives it, with first weights of ``seed``; raises OptionError.
+
+    Args:
+        adapted: whether it will be trained.
+    """
+    torch.manual_seed(seed)
+    if name == "small":
+        return Small()
+    if Path(name).exists() and not (Path(name) / "config.json").is_file():
+        raise OptionError(
+            f"{name} has no config.json; give a folder with weights of Depth Anything, or small"
+        )
+    return DepthAnything(name, adapted)

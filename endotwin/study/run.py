@@ -1,0 +1,341 @@
+"""The experiment: datasets rendered, networks trained and judged, each result kept as soon as it is there."""
+
+from __future__ import annotations
+
+import json
+import logging
+import shutil
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib.util import find_spec
+from itertools import chain
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from endotwin import pipeline
+from endotwin.cameras import Camera
+from endotwin.errors import OptionError, OutputError, TwinError
+from endotwin.run.output import DATASET, STUDY, check_apart, check_free, move_folder, unwritable, whole_file
+from endotwin.run.threads import device_of
+from endotwin.sequence import Sequence
+from endotwin.sequence.readers import open_sequence
+from endotwin.study import judge, report
+from endotwin.study.arms import HEADLINE, Arm, arms
+from endotwin.study.frames import Frames, kept, lit_pixels, of_dataset, of_sequence
+from endotwin.study.leak import require_unseen
+from endotwin.study.networks import found, network
+from endotwin.study.recipe import ROTATION_DEG, TRANSLATION_MM, Recipe
+from endotwin.study.train import LOSSES, Course, train
+from endotwin.tradeoff.run import PARTIAL, machine
+from endotwin.twin import Twin
+
+Progress = Callable[[str, int, int], None]
+
+OWN = ("study", "results", "networks", "recipes", "depth")
+"""First parts of the names that a finished folder holds."""
+
+SUPERSAMPLING = 2
+"""Frames are rendered at so many times the network's width, and each pixel is the mean of what it covers."""
+
+logger = logging.getLogger("endotwin")
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What is asked.
+
+    Attributes:
+        parts: of ``arms.PARTS``; the headline is always there.
+        network: ``auto``, ``small``, or a folder with weights of Depth Anything.
+        frames: that are rendered for an arm. seeds: trainings of each arm.
+        steps: of each training; None: the network's own. loss: a name among ``train.LOSSES``.
+        device: cpu, cuda or auto.
+    """
+
+    parts: tuple[str, ...] = ("headline",)
+    network: str = "auto"
+    frames: int = 500
+    steps: int | None = None
+    seeds: int = 3
+    loss: str = "huber"
+    device: str = "cpu"
+
+    def __post_init__(self) -> None:
+        for name in ("frames", "seeds"):
+            if getattr(self, name) < 1:
+                raise OptionError(f"the number of {name} is {getattr(self, name)}, but must be at least 1")
+        if self.steps is not None and self.steps < 1:
+            raise OptionError(f"the number of steps is {self.steps}, but must be at least 1")
+        if self.loss not in LOSSES:
+            raise OptionError(f"there is no loss {self.loss!r}; choose one of {', '.join(LOSSES)}")
+
+
+def study_depth(
+    real: list[Path],
+    twins: list[Path],
+    tests: list[Path],
+    out: Path,
+    plan: Plan = Plan(),
+    overwrite: bool = False,
+    progress: Progress | None = None,
+) -> report.Findings:
+    """Train depth networks on real frames, on frames rendered from twins, and on both; judge them on others.
+
+    Until all is done what is found lies in ``out.partial``, and the same call goes on from there.
+
+    Args:
+        real: sequences, all of whose frames are trained on.
+        twins: fitted twins that frames are rendered from.
+        tests: sequences, all of whose frames are tested on; no twin and no network may have seen them.
+
+    Raises:
+        LeakError: one has. SequenceError, TwinError: an input cannot be used. OptionError: an option makes no
+        sense. OutputError: ``out`` is taken, or ``out.partial`` is another study's.
+    """
+    if find_spec("webdataset") is None:
+        raise OptionError(
+            "the study reads datasets with webdataset; install it with pip install 'endotwin[depth]'"
+        )
+    check_free(out, overwrite, STUDY)
+    check_apart(out, [*real, *twins, *tests])
+    experiment = _Experiment(real, twins, tests, out, plan, progress or (lambda *_: None))
+    try:
+        return experiment.run()
+    except OSError as error:
+        told = unwritable(Path(error.filename or experiment.work), error)
+        raise OutputError(f"{told}; the same command goes on from {experiment.work}") from error
+
+
+class _Experiment:
+    """What ``study_depth`` does, in the folder ``out.partial`` and at last in ``out``."""
+
+    def __init__(
+        self,
+        real: list[Path],
+        twins: list[Path],
+        tests: list[Path],
+        out: Path,
+        plan: Plan,
+        progress: Progress,
+    ) -> None:
+        for what, given in (("--real", real), ("--twin", twins), ("--test", tests)):
+            if not given:
+                raise OptionError(f"the study needs at least one {what}")
+        self.plan, self.out, self.progress = plan, Path(out), progress
+        self.work = self.out.absolute().with_name(self.out.name + PARTIAL)
+        self.device = device_of(plan.device)
+        self.twins = {Path(folder): _fitted(folder) for folder in twins}
+        self.real, self.tests = ([open_sequence(path) for path in each] for each in (real, tests))
+        self.unseen = require_unseen(self.tests, self.real, self.twins)
+        self.network = found(plan.network)
+        sample = network(self.network, 0)
+        self.size, self.batch, self.rate = sample.size, sample.batch, sample.rate
+        self.steps = (
+            plan.steps or getattr(sample, "steps", None) or sample.epochs * plan.frames // sample.batch
+        )
+        self.parameters = sum(each.numel() for each in sample.parameters() if each.requires_grad)
+        self.arms = arms(plan.parts, plan.frames)
+        self._pools: dict[str, Frames] = {}
+
+    def run(self) -> report.Findings:
+        self._enter()
+        try:
+            for number, arm in enumerate(self.arms):
+                for seed in range(self.plan.seeds):
+                    self._result(arm, seed, f"{number + 1}/{len(self.arms)}")
+            if self.network != "small":
+                self._zero_shot()
+            if "robustness" in self.plan.parts:
+                self._robustness()
+        except BaseException as stopped:
+            stopped.add_note(f"the same command goes on from {self.work}")
+            raise
+        findings = report.Findings.read(self.work, self.arms, self.plan.seeds, self._facts())
+        report.write(findings, self.work)
+        self._pools.clear()  # which hold files open
+        for name in ("datasets", "frames"):
+            shutil.rmtree(self.work / name, ignore_errors=True)
+        move_folder(self.work, self.out, lambda name: name.parts[0].partition(".")[0] in OWN)
+        return findings
+
+    def _enter(self) -> None:
+        """Make the working folder; or go on in it, or from what is in ``out``, if that was asked then too."""
+        asked = {
+            "real": [str(sequence.path.resolve()) for sequence in self.real],
+            "twins": {str(folder.resolve()): twin.seal for folder, twin in self.twins.items()},
+            "tests": [str(sequence.path.resolve()) for sequence in self.tests],
+            "network": self.network,
+            "frames": self.plan.frames,
+            "steps": self.steps,
+            "loss": self.plan.loss,
+        }
+        question = self.work / STUDY
+        if question.exists() and _read(question) != asked:
+            raise OutputError(
+                f"{self.work} holds the results of another study; delete it or choose another -o"
+            )
+        done = self.out / STUDY
+        if not question.exists() and done.exists() and _read(done) == asked:  # and more parts are wanted
+            shutil.copytree(self.out, self.work)
+        for folder in ("results", "networks", "recipes", "datasets", "frames"):
+            (self.work / folder).mkdir(parents=True, exist_ok=True)
+        _keep(asked, question)
+
+    # What is trained and tested on
+
+    def _sequences(self, name: str, sequences: list[Sequence], size: tuple[int, int]) -> Frames:
+        """Frames of sequences at ``size``."""
+        frames = chain.from_iterable(of_sequence(sequence, size) for sequence in sequences)
+        asked = {"source": ", ".join(str(sequence.path) for sequence in sequences), "size": list(size)}
+        return kept(frames, sum(map(len, sequences)), size, self.work / "frames" / name, asked)
+
+    def _pool(self, name: str) -> Frames:
+        if name not in self._pools:
+            if name == "real":
+                self._pools[name] = self._sequences("real", self.real, self.size)
+            else:
+                recipe = next(arm.recipe for arm in self.arms if arm.recipe and arm.recipe.name == name)
+                self._pools[name] = self._rendered(recipe)
+        return self._pools[name]
+
+    def _rendered(self, recipe: Recipe) -> Frames:
+        """The frames of a recipe: evenly from all twins, through each lens."""
+        shares = [(twin, *lens) for twin in self.twins.values() for lens in self._lenses(twin, recipe)]
+        recipe.write(self.work / "recipes" / f"{recipe.name}.yaml")
+        parts, count = [], 0
+        for number, (twin, lens, lit) in enumerate(shares):
+            if wanted := len(range(number, self.plan.frames, len(shares))):
+                data = self._dataset(recipe, f"{recipe.name}-{number}", twin, lens, wanted)
+                parts.append(of_dataset(data, self.size, lit, recipe.codec))
+                count += _read(data / DATASET)["frames"]
+        folder = self.work / "frames" / recipe.name
+        return kept(chain(*parts), count, self.size, folder, {"source": recipe.name, "size": list(self.size)})
+
+    def _dataset(self, recipe: Recipe, name: str, twin: Twin, lens: Camera, count: int) -> Path:
+        """The dataset ``name`` of so many poses, rendered unless it is there."""
+        data, lens_file = self.work / "datasets" / name, self.work / "recipes" / f"{name}.camera.json"
+        if not data.exists():
+            _keep(lens.to_dict(), lens_file)
+            pipeline.synthesize(
+                twin,
+                f"jitter:frames={count},translation={TRANSLATION_MM},rotation={ROTATION_DEG}",
+                data,
+                vary=self.work / "recipes" / f"{recipe.name}.yaml",
+                camera=lens_file,
+                labels="rgb,depth,mask",
+                layout="webdataset",
+                progress=lambda _, done, total: self.progress(f"render {recipe.name}", done, total),
+            )
+        return data
+
+    def _lenses(self, twin: Twin, recipe: Recipe) -> list[tuple[Camera, np.ndarray]]:
+        """The twin's own lens, and where the recipe says so those of the tests, each once: the camera, and
+        which pixels are not black around its circle."""
+        width = SUPERSAMPLING * self.size[0]
+        found = {}
+        for sequence in (twin.sequence(), *(self.tests if recipe.lenses else ())):
+            camera = sequence.camera.scaled(min(1.0, width / sequence.camera.width))
+            key = json.dumps(camera.to_dict())
+            if key not in found:
+                found[key] = camera, lit_pixels(sequence, self.size)
+        return list(found.values())
+
+    # Training and judging
+
+    def _result(self, arm: Arm, seed: int, number: str) -> None:
+        """Train an arm with one seed and judge it, unless that was done."""
+        result = self.work / "results" / f"{arm.name}.{seed}.json"
+        if result.exists():
+            return
+        started = time.monotonic()
+        trained = self._trained(arm, seed, f"{arm.name}, seed {seed} ({number})")
+        _keep({"scores": self._judged(trained), "seconds": time.monotonic() - started}, result)
+
+    def _judged(self, trained: torch.nn.Module) -> list[dict]:
+        """Scores of each test."""
+        return [judge.judged(trained, self._test(number), self.device) for number in range(len(self.tests))]
+
+    def _trained(self, arm: Arm, seed: int, label: str) -> torch.nn.Module:
+        pools = [self._pool("real")] if arm.real else []
+        if arm.recipe:
+            rendered = self._pool(arm.recipe.name)
+            pools.append(rendered.some(arm.frames) if arm.frames else rendered)
+        course = Course(self.steps, self.batch, self.rate, self.plan.loss, seed)
+        checkpoint = self.work / "networks" / f"{arm.name}.{seed}.pt"
+        return train(
+            network(self.network, seed),
+            pools,
+            course,
+            checkpoint,
+            lambda done: self.progress(label, done, self.steps),
+            self.device,
+        )
+
+    def _test(self, number: int) -> Frames:
+        return self._sequences(f"test-{number}", [self.tests[number]], self.size)
+
+    def _zero_shot(self) -> None:
+        """Judge the network as its authors published it."""
+        result = self.work / "results" / "zero-shot.0.json"
+        if not result.exists():
+            plain = network(self.network, 0, adapted=False).to(self.device).eval()
+            _keep({"scores": self._judged(plain), "seconds": 0.0}, result)
+
+    def _robustness(self) -> None:
+        """Judge the first seed of each headline arm after each corruption."""
+        width, height = self.size
+        large = (judge.CORRUPTED_WIDTH, round(height * judge.CORRUPTED_WIDTH / width))
+        networks = {arm.name: self._trained(arm, 0, arm.name) for arm in HEADLINE}
+        for number, test in enumerate(self.tests):
+            result = self.work / "results" / f"robustness.{number}.json"
+            self.progress("corruptions", number, len(self.tests))
+            if not result.exists():
+                frames = self._sequences(f"large-{number}", [test], large)
+                _keep(judge.judged_corrupted(networks, frames, self.size, self.device), result)
+
+    def _facts(self) -> dict:
+        """What the page says beside the numbers."""
+        width, height = self.size
+        return {
+            "network": self.network,
+            "parameters": self.parameters,
+            "size": f"{width}×{height}",
+            "steps": self.steps,
+            "batch": self.batch,
+            "loss": self.plan.loss,
+            "seeds": self.plan.seeds,
+            "frames": {"real": sum(map(len, self.real)), "rendered": self.plan.frames},
+            "real": [sequence.path.name for sequence in self.real],
+            "twins": [folder.name for folder in self.twins],
+            "tests": _names(self.tests),
+            "test_frames": [len(sequence) for sequence in self.tests],
+            "trajectory": f"jitter:translation={TRANSLATION_MM},rotation={ROTATION_DEG}",
+            "unseen": self.unseen,
+            "machine": machine(),
+        }
+
+
+def _names(sequences: list[Sequence]) -> list[str]:
+    """What the sequences are called: their folders' names, or the whole paths where two are the same."""
+    names = [sequence.path.name for sequence in sequences]
+    return names if len(set(names)) == len(names) else [str(sequence.path) for sequence in sequences]
+
+
+def _fitted(folder: Path) -> Twin:
+    twin = Twin.load(Path(folder))
+    if not twin.fitted:
+        raise TwinError(f"{folder} has no materials yet; run 'endotwin fit {folder}' first")
+    return twin
+
+
+def _read(path: Path) -> dict:
+    return json.loads(path.read_text(encoding="utf-8"))
+
+
+def _keep(content: dict, path: Path) -> None:
+    """Write JSON whole or not at all."""
+    with whole_file(path, overwrite=True) as file:
+        file.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")

@@ -1,0 +1,222 @@
+"""The depth experiment as a user runs it: what it trains on, what it refuses, what it writes."""
+
+import csv
+import io
+import json
+import os
+import shutil
+import signal
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tube_sequence
+from command_line import invoke
+from endotwin.cli import console
+
+import endotwin
+from endotwin.errors import OptionError, TwinError
+from endotwin.sequence.readers import open_sequence
+from endotwin.study import parse_parts, study_depth
+from endotwin.study.accuracy import METRICS
+from endotwin.study.arms import HEADLINE, TASTED, arms
+from endotwin.study.corruptions import CORRUPTIONS
+from endotwin.study.frames import kept, of_dataset, of_sequence
+from endotwin.study.leak import LeakError, require_unseen
+from endotwin.study.recipe import EVERYTHING, INGREDIENTS, RENDERED
+from endotwin.study.run import Plan
+from endotwin.synth import read_variation
+from endotwin.synth.variation import Variation
+from endotwin.twin import Twin
+
+
+@pytest.fixture(scope="module")
+def other(made):
+    """A sequence of other photos than the twin's."""
+    return tube_sequence.write(made / "other", 3, 40, 30)
+
+
+@pytest.fixture
+def study(made, other, capfd):
+    """Run ``endotwin study depth`` on the twin: exit code, stdout, stderr."""
+
+    def run(*arguments: object, test: Path = other) -> tuple[int, str, str]:
+        capfd.readouterr()
+        inputs = ("--real", made / "tube", "--twin", made / "twin", "--test", test, "--network", "small")
+        code = invoke("study", "depth", *inputs, "--frames", 4, "--steps", 2, "--seeds", 1, *arguments)
+        return code, *capfd.readouterr()
+
+    return run
+
+
+@pytest.mark.slow
+def test_all_parts_end_in_a_table_a_plot_and_a_page(study, tmp_path):
+    code, out, err = study("--parts", "all", "-o", tmp_path / "s")
+    assert code == 0, err
+    assert {file.name for file in (tmp_path / "s").iterdir()} == {
+        *("depth.csv", "depth.png", "depth.svg", "depth.html"),
+        *("study.json", "results", "networks", "recipes"),
+    }
+    names = [arm.name for arm in (*HEADLINE, *TASTED)]
+    assert all(name in out for name in names) and "AbsRel" in out
+    rows = list(csv.DictReader(io.StringIO((tmp_path / "s" / "depth.csv").read_text(encoding="utf-8"))))
+    assert [row["arm"] for row in rows[::2]] == names
+    assert all(0 < float(row[metric]) < 1000 for row in rows for metric in METRICS[:4])
+    page = (tmp_path / "s" / "depth.html").read_text(encoding="utf-8")
+    assert all(name in page for name in (*names, *CORRUPTIONS))
+    assert "endotwin synth TWIN --trajectory jitter:" in page and "none of the photos and depth maps" in page
+    assert [entry.name for entry in tmp_path.iterdir()] == ["s"]
+
+
+@pytest.mark.slow
+def test_a_stopped_study_goes_on_to_the_same_numbers_and_more_parts_go_on_from_them(
+    study, tmp_path, monkeypatch
+):
+    assert study("-o", tmp_path / "whole")[0] == 0
+
+    def stop(self, label, done, total):
+        if label.startswith("both"):
+            os.kill(os.getpid(), signal.SIGINT)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(console.Run, "progress", stop)
+        code, out, err = study("-o", tmp_path / "parted")
+    assert (code, out) == (130, "") and "the same command goes on" in err and err.count("\n") == 1
+    assert not (tmp_path / "parted").exists()
+    results = tmp_path / "parted.partial" / "results"
+    assert {file.name for file in results.iterdir()} == {"real.0.json", "rendered.0.json"}
+    trained = []
+    monkeypatch.setattr(console.Run, "progress", lambda self, label, done, total: trained.append(label))
+    assert study("-o", tmp_path / "parted")[0] == 0
+    assert any(label.startswith("both") for label in trained)
+    assert not any(label.startswith(("real,", "rendered,")) for label in trained)
+    whole, parted = ((tmp_path / name / "depth.csv").read_text() for name in ("whole", "parted"))
+    assert whole == parted
+    trained.clear()
+    assert study("-o", tmp_path / "parted", "--parts", "ingredients", "--overwrite")[0] == 0
+    assert any(label.startswith("everything") for label in trained)
+    assert not any(label.startswith("both") for label in trained)
+    assert parted.splitlines()[:7] == (tmp_path / "parted" / "depth.csv").read_text().splitlines()[:7]
+
+
+def test_a_test_that_the_twin_was_made_from_is_refused_under_any_name(made, study, tmp_path):
+    shutil.copytree(made / "tube", tmp_path / "renamed")
+    for test in (made / "tube", tmp_path / "renamed"):
+        code, out, err = study("-o", tmp_path / "s", test=test)
+        assert (code, out) == (2, "")
+        assert err.startswith("error: ") and err.count("\n") == 1 and "cannot be a test" in err
+    assert [entry.name for entry in tmp_path.iterdir()] == ["renamed"]
+
+
+def test_one_photo_or_one_depth_map_in_common_is_a_leak(made, other, tmp_path):
+    twins = {made / "twin": Twin.load(made / "twin")}
+    for name in ("0002_color.png", "0002_depth.tiff"):
+        mixed = tube_sequence.write(tmp_path / name, 3, 48, 36)
+        for file in mixed.glob("*_*"):
+            if file.name != name:
+                blacken(file)
+        with pytest.raises(LeakError, match="knows 1 of its photos"):
+            require_unseen([open_sequence(mixed)], [], twins)
+    assert "none of the photos" in require_unseen([open_sequence(other)], [], twins)
+
+
+def blacken(file: Path) -> None:
+    """Change the pixels of a photo or depth map."""
+    import cv2
+
+    image = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
+    image[: len(image) // 2] = image[0, 0] // 2
+    cv2.imwrite(str(file), image)
+
+
+def test_a_test_that_is_trained_on_is_refused(made, other):
+    with pytest.raises(LeakError, match="--real"):
+        require_unseen([open_sequence(other)], [open_sequence(other)], {})
+
+
+def test_a_twin_whose_sequence_is_gone_is_judged_by_its_name(made, other, tmp_path, caplog):
+    shutil.copytree(made / "tube", tmp_path / "lost")
+    twin = endotwin.fuse_twin(tmp_path / "lost")
+    shutil.rmtree(tmp_path / "lost")
+    require_unseen([open_sequence(other)], [], {Path("twin"): twin})
+    assert "by name alone" in caplog.text
+    elsewhere = tube_sequence.write(tmp_path / "elsewhere" / "lost", 2, 40, 30)
+    with pytest.raises(LeakError, match="of this name"):
+        require_unseen([open_sequence(elsewhere)], [], {Path("twin"): twin})
+
+
+@pytest.mark.parametrize(
+    ("options", "told"),
+    [
+        (["--parts", "headline,tail"], "tail"),
+        (["--loss", "l2"], "huber"),
+        (["--network", "nowhere"], "weights of Depth Anything"),
+        (["--seeds", "0"], "seeds"),
+        (["--frames", "0"], "frames"),
+        (["--steps", "-1"], "steps"),
+        (["--device", "tpu"], "tpu"),
+        (["--twin", "nowhere"], "nowhere"),
+        (["--test", "nowhere"], "nowhere"),
+    ],
+    ids=" ".join,
+)
+def test_what_makes_no_sense_is_refused_in_one_line_and_nothing_is_left(study, tmp_path, options, told):
+    code, out, err = study("-o", tmp_path / "s", *options)
+    assert (code, out) == (2, "")
+    assert err.startswith("error: ") and err.count("\n") == 1 and told in err, err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_twin_that_is_not_fitted_is_refused(made, other, tmp_path):
+    endotwin.fuse_twin(made / "tube").save(tmp_path / "fused")
+    with pytest.raises(TwinError, match="endotwin fit"):
+        study_depth([made / "tube"], [tmp_path / "fused"], [other], tmp_path / "s", Plan(network="small"))
+
+
+def test_frames_of_a_dataset_are_those_that_were_rendered(made, tmp_path):
+    """Photos and depth of a webdataset against the same dataset as C3VD's reader has it."""
+    twin = made / "twin"
+    for layout in ("webdataset", "c3vd"):
+        endotwin.synthesize(
+            twin, "jitter:frames=3,rotation=2", tmp_path / layout, layout=layout, labels="rgb,depth,mask"
+        )
+    sequence = open_sequence(tmp_path / "c3vd")
+    size = (sequence.camera.width, sequence.camera.height)
+    lit = np.ones(size[::-1], bool)
+    lit[:, :7] = False
+    for index, (color, depth_mm) in enumerate(of_dataset(tmp_path / "webdataset", size, lit)):
+        assert np.array_equal(color[lit], sequence.color(index)[lit]) and not color[~lit].any()
+        expected = np.where(lit, sequence.depth_mm(index), np.nan)
+        assert np.nanmax(np.abs(depth_mm - expected)) < 1e-4
+        assert np.isfinite(depth_mm).sum() <= np.isfinite(expected).sum() and np.isnan(depth_mm[~lit]).all()
+    assert index == 2
+
+
+def test_kept_frames_are_read_again_unless_something_else_is_asked(other, tmp_path):
+    sequence, size = open_sequence(other), (20, 16)
+    frames = kept(of_sequence(sequence, size), 3, size, tmp_path / "f", {"source": "a"})
+    assert frames.color.shape == (3, 16, 20, 3) and frames.depth_mm.shape == (3, 16, 20)
+    again = kept(iter(()), 3, size, tmp_path / "f", {"source": "a"})
+    assert np.array_equal(again.color, frames.color)
+    blind = [(color, np.full_like(depth_mm, np.nan)) for color, depth_mm in (frames[0], frames[1])]
+    with pytest.raises(OptionError, match="b has no depth"):
+        kept(iter(blind), 2, size, tmp_path / "f", {"source": "b"})
+    assert len(frames.some(2)) == 2 and len(frames.some(9)) == 3
+
+
+def test_recipes_are_ranges_that_synth_understands_and_all_has_every_one(made, tmp_path):
+    twin = Twin.load(made / "twin")
+    for recipe in (*INGREDIENTS, RENDERED, EVERYTHING):
+        recipe.write(tmp_path / "vary.yaml")
+        drawn = read_variation(tmp_path / "vary.yaml", twin, Variation()).to_dict()
+        for key, values in recipe.vary.items():
+            assert len(drawn[key]) == len(values)
+    assert RENDERED.lenses and EVERYTHING.lenses and EVERYTHING.codec
+    for key in ("material", "light", "response", "parameters"):
+        assert EVERYTHING.vary[key] == [each for recipe in INGREDIENTS for each in recipe.vary.get(key, [])]
+
+
+def test_arms_of_the_curve_have_fewer_frames_than_there_are():
+    names = [arm.name for arm in arms(parse_parts("curve"), 500)]
+    assert names == ["real", "rendered", "both", "rendered@50", "rendered@100", "rendered@200"]
+    assert json.dumps(parse_parts("all")) == '["headline", "ingredients", "curve", "robustness"]'
