@@ -8,6 +8,7 @@ that folds too fine for the lighter mesh stay in its shading.
 
 from __future__ import annotations
 
+import ctypes
 import math
 from dataclasses import dataclass
 from functools import cached_property
@@ -138,10 +139,14 @@ def _simplified(surface: Surface) -> tuple[np.ndarray, np.ndarray]:
 def _unwrapped(
     vertices: np.ndarray, normals: np.ndarray, triangles: np.ndarray, texel: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, tuple[int, int]]:
-    """Vertices, normals, uv and triangles of an atlas, split at its seams, and its width and height."""
+    """Vertices, normals, uv and triangles of an atlas, split at its seams, and its width and height.
+
+    The atlas is never freed: where xatlas ends its threads, a wake-up can be lost, and it waits for ever.
+    """
     import xatlas
 
     atlas = xatlas.Atlas()
+    ctypes.pythonapi.Py_IncRef(ctypes.py_object(atlas))
     atlas.add_mesh(vertices, triangles.astype(np.uint32), normals)
     charts, packing = xatlas.ChartOptions(), xatlas.PackOptions()
     packing.texels_per_unit, packing.padding, packing.bilinear = 1 / texel, GUTTER, True
