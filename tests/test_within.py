@@ -111,3 +111,17 @@ def test_photos_without_a_usable_pixel_change_nothing():
     within, material = photographed()
     white = replace(within.samples, color=torch.full_like(within.samples.color, 255))
     assert replace(within, samples=white).renewed(material, TRUE, (), NOISE) is TRUE
+
+
+def test_under_a_coat_that_shines_a_clipped_photo_says_at_least():
+    within, material = photographed()
+    white = replace(within, samples=replace(within.samples, color=torch.full_like(within.samples.color, 255)))
+    every = torch.ones(len(material), dtype=torch.bool)
+
+    def seen(weight: float, L0: float) -> np.ndarray:
+        shared = Globals.of(Light(L0, 1.7, 2.2), Response(0.42), f0=0.035)
+        return white.sightings(material, replace(shared, coat=Coat(weight, 0.1)), every, NOISE).residual
+
+    assert not len(seen(0.0, 120.0))
+    assert len(seen(0.5, 120.0)) > 1000 and (seen(0.5, 120.0) > 0).all()
+    assert not len(seen(0.5, 1e9))

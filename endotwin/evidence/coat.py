@@ -65,8 +65,8 @@ def best_coat(under: Callable[[Coat], Highlights]) -> tuple[Coat, Verdict]:
     """The coat that predicts highlights best, and by how much better than none it does on vertices that did
     not choose its weight.
 
-    Lobes are ranked by what they leave after a second step, since a coat may outshine what is under it, where
-    the logarithm is far from linear in its weight.
+    Lobes are ranked by what they leave after a second step: a coat may outshine what is under it, where the
+    logarithm is far from linear in its weight, and only one that shines can be held against clipped photos.
     """
     width, least, best = 0.0, np.inf, None
     for lobe in (Coat(0.0, roughness, tail) for tail in TAILS for roughness in ROUGHNESSES):
@@ -79,7 +79,7 @@ def best_coat(under: Callable[[Coat], Highlights]) -> tuple[Coat, Verdict]:
             continue
         near = under(replace(lobe, weight=weight))
         found = regress(near.residual, near.design, rounds=SEARCH_ROUNDS)
-        loss = float(robust_losses(near.residual, near.design, found, width).mean())
+        loss = float(robust_losses(near.residual, near.design, found, width).sum())
         if loss < least:
             least, best = loss, (replace(lobe, weight=weight + float(found.coefficients[1])), seen)
     if best is None:

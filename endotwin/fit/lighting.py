@@ -105,6 +105,11 @@ class Relighting:
         roughness = at_pixels(samples, triangles, materials[:, 3:])[:, 0]
         return self._bouncer.bounced(samples, roughness, materials, triangles, state.shared)
 
+    def relit(self, samples: Samples, triangles: Tensor, state: State) -> Samples:
+        """``bounced``, and with the gain that was found last."""
+        samples = self.bounced(samples, triangles, state)
+        return exposed(samples, self.effects) if "gain" in self.effects else samples
+
     def __call__(self, solver: GaussNewton, state: State) -> None:
         """Relight the samples of ``solver`` as ``state`` says."""
         materials = state.materials

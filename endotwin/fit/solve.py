@@ -151,7 +151,12 @@ def fit_twin(
         wanted = states.get("coat", "auto") if "specular" in decided.effects else "off"
         count = min(LIGHT_PIXELS, int(LIGHT_SHARE * pace.start_pixels))
         rows = telling[torch.from_numpy(drawn(len(telling), count, np.random.default_rng(seed)))]
-        state, cost, coat = _find_light(samples[rows], surface, start, pace, relighting, wanted, device)
+        clipped = torch.from_numpy(np.flatnonzero(_telling(samples, surface, clipped=True)))
+        clipped = clipped[
+            drawn(len(clipped), len(clipped) * len(rows) // len(every), np.random.default_rng(seed))
+        ]
+        parts = samples[rows], samples[clipped]
+        state, cost, coat = _find_light(*parts, surface, start, pace, relighting, wanted, device)
     with stopwatch.stage("detail"):
         state, normals, left = _find_detail(samples, twin, state, cost, pace, relighting, device)
         twin = replace(twin, surface=replace(surface, normals=normals))
@@ -184,14 +189,15 @@ def _without_bounce(decision: Decision) -> Decision:
     return replace(decision, reason=f"{decision.reason}; but the fit finds none of it: strength 0")
 
 
-def _telling(samples: Samples, surface: Surface) -> np.ndarray:
-    """Bool [N]: samples off the creases of the surface and below saturation."""
+def _telling(samples: Samples, surface: Surface, clipped: bool = False) -> np.ndarray:
+    """Bool [N]: samples off the creases of the surface and below saturation; or, ``clipped``, in it."""
     smooth = surface.normal_agreement() > np.cos(np.radians(CERTAIN_NORMAL_DEG))
-    return smooth[samples.triangle.numpy()] & (samples.color.amax(dim=1).numpy() < BRIGHT)
+    return smooth[samples.triangle.numpy()] & ((samples.color.amax(dim=1).numpy() >= BRIGHT) == clipped)
 
 
 def _find_light(
     samples: Samples,
+    clipped: Samples,
     surface: Surface,
     start: Start,
     pace: Pace,
@@ -200,7 +206,7 @@ def _find_light(
     device: torch.device,
 ) -> tuple[State, _Cost, Decision]:
     """Light, response, f0 and coarse materials; what they cost; and whether there is a coat, which is auto,
-    on or off."""
+    on or off, and held against the ``clipped`` samples, too."""
     unit = unit_mm(surface)
     points, group = proxies(surface.vertices_mm, unit * LIGHT_CELL_MM / PROXIES)
     began = pace.stopwatch.total
@@ -239,7 +245,11 @@ def _find_light(
         material = at_pixels(solver.samples, solver.triangles, state.materials)
         shared, noise = state.shared, solver.noise(state)
         if number == (0 if coat == "on" else COAT_STEP):
-            layer, judged = judged_coat(within.highlights(material, shared, noise), coat)
+            under = relighting.relit(clipped, solver.triangles, state)
+            shiny = Samples.joined([solver.samples, under], solver.samples.views)
+            seen = Within.of(shiny, surface, unit)
+            seen_material = at_pixels(shiny, solver.triangles, state.materials)
+            layer, judged = judged_coat(seen.highlights(seen_material, shared, noise), coat)
             shared = replace(shared, coat=layer)
         if relighting.bounces:
             solver.held = (*start.undetermined, "L0", *(("albedo scale",) * (number < HOLD_STEPS)))

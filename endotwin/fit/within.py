@@ -130,25 +130,28 @@ class Within:
         return bounded(shared, shared.vector + torch.from_numpy(length * along))
 
     def sightings(self, material: Tensor, shared: Globals, chosen: Tensor, noise: float) -> Sightings:
-        """Sightings of the ``chosen`` samples (bool [N]) that are neither dark nor clipped.
+        """Sightings of the ``chosen`` samples (bool [N]) that are neither dark nor clipped; but under a coat
+        that shines a clipped channel says 'at least'.
 
         What varies among the pixels of a sighting is where about the vertex they lie: texture, not light.
         """
-        rows = torch.nonzero(chosen)[:, 0]
-        color = self.samples.color[rows]
-        shown = color.double().mean(dim=1)
-        usable = (color.amax(dim=1) < BRIGHT) & (shown > 0)
-        rows, shown = rows[usable], shown[usable]
+        clipped = self.samples.color >= BRIGHT
+        usable = chosen & (self.samples.color.amax(dim=1) > 0)
+        if shared.coat is None or shared.coat.weight == 0:
+            usable &= ~clipped.any(dim=1)
+        rows = torch.nonzero(usable)[:, 0]
         model = linearise(self.samples[rows], material[rows], shared)
+        tells = ~clipped[rows] | (model.predicted < 1)
         floor = math.exp(shared.gamma * math.log(shading.RADIANCE_MIN))
-        predicted = model.predicted.double().mean(dim=1)
-        bright = predicted > DARKEST
-        rows, shown, predicted = rows[bright], shown[bright].numpy(), (predicted[bright] + floor).numpy()
+        predicted = torch.where(tells, model.predicted, 1.0).double().mean(dim=1)
+        bright = (predicted > DARKEST) & tells.any(dim=1)
+        rows, tells, predicted = rows[bright], tells[bright].double(), (predicted[bright] + floor).numpy()
+        shown = self.samples.color[rows].double().mean(dim=1).numpy()
         residual = np.log(shown / 255 + floor) - np.log(predicted)
-        slopes = model.by_globals[bright].double().mean(dim=1).numpy() / predicted[:, None]
+        slopes = (model.by_globals[bright] * tells[..., None]).mean(dim=1).numpy() / predicted[:, None]
         by_coat = np.zeros(len(predicted))
         if model.by_coat is not None:
-            by_coat = model.by_coat[bright].double().mean(dim=1).numpy() / predicted
+            by_coat = (model.by_coat[bright] * tells).mean(dim=1).numpy() / predicted
         weight = 1 / ((noise / predicted) ** 2 + MODEL_ERROR**2)
         place = self.vertex[rows.numpy()].astype(np.int64) << 32 | self.samples.frame[rows].numpy()
         place, which = np.unique(place, return_inverse=True)

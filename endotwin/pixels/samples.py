@@ -105,10 +105,7 @@ class Samples:
     @classmethod
     def joined(cls, parts: list[Samples], views: Views) -> Samples:
         """The samples of all ``parts``, in their order."""
-        names = [name for name, value in vars(parts[0]).items() if value is not None]
-        return cls(
-            **{name: torch.cat([getattr(part, name) for part in parts]) for name in names}, views=views
-        )
+        return _joined([replace(part, views=None) for part in parts], views=views)
 
     def nearest(self, triangles: np.ndarray) -> np.ndarray:
         """The vertex that each is nearest to, int [N], among the corners of ``triangles`` [F, 3]."""
@@ -150,6 +147,18 @@ def drawn(count: int, wanted: int, generator: np.random.Generator) -> np.ndarray
     if count <= wanted:
         return np.arange(count)
     return np.flatnonzero(generator.random(count, np.float32) < wanted / count)
+
+
+def _joined(parts: list, **more):
+    """Dataclasses of one kind whose columns, and those of their columns, are joined; None stays None."""
+    columns = {}
+    for name, value in vars(parts[0]).items():
+        values = [getattr(part, name) for part in parts]
+        if isinstance(value, Tensor):
+            columns[name] = torch.cat(values)
+        elif value is not None:
+            columns[name] = _joined(values)
+    return type(parts[0])(**columns | more)
 
 
 def gather(twin: Twin, pace: Pace, seed: int, caster: Caster) -> Samples:
