@@ -47,18 +47,26 @@ def check(
     Example: endotwin check examples/colon_small
     """
     with console.command("check", profile) as run:
-        with run.stage("import"):
-            from endotwin.check import check
-            from endotwin.synth import prove
-        with run.stage("check"):
-            found = (
-                prove(sequence, progress=run.progress) if labels else check(sequence, format, run.progress)
-            )
+        found = _proof(run, sequence) if labels else _report(run, sequence, format)
     if json:
         print(json_format.dumps(found.to_dict()))
     else:
         (_show_proof if labels else _show)(found)
     raise typer.Exit(0 if (found.holds if labels else found.consistent) else 1)
+
+
+def _report(run: console.Run, sequence: Path, format: str | None) -> Report:
+    with run.stage("import"):
+        from endotwin.check import check
+    with run.stage("check"):
+        return check(sequence, format, run.progress)
+
+
+def _proof(run: console.Run, dataset: Path) -> Proof:
+    with run.stage("import"):
+        from endotwin.synth import prove
+    with run.stage("check"):
+        return prove(dataset, progress=run.progress)
 
 
 def _show_proof(proof: Proof) -> None:

@@ -137,13 +137,8 @@ def synth(
             twin = Twin.load(twin_folder)
         limits = Limits(clearance, max_unseen, float("inf") if max_distance is None else max_distance)
         choices = {"material": material or (), "light": light or (), "vary": vary, "camera": camera}
-        choices |= {
-            "effects": parse_states(effects, like=True),
-            "limits": limits,
-            "seed": seed,
-            "overwrite": overwrite,
-        }
-        choices["motion"] = motion or ()
+        choices |= {"effects": parse_states(effects, like=True), "motion": motion or ()}
+        choices |= {"limits": limits, "seed": seed, "overwrite": overwrite}
         with run.stage("synth"):
             if preview:
                 summary = pipeline.preview(twin, trajectory, preview, **choices)

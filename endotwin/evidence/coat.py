@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -35,7 +36,7 @@ class Highlights:
     by_f0: np.ndarray
     by_coat: np.ndarray
 
-    @property
+    @cached_property
     def design(self) -> Design:
         """f0 and coat, beside an intercept a vertex."""
         vertex = np.unique(self.vertex, return_inverse=True)[1].reshape(-1)

@@ -64,7 +64,7 @@ class Appearance:
         """What ``twin`` has."""
         effects = twin.effects
         coat, lens = effects.get("coat"), effects.get("vignetting")
-        film = effects.get("film") if twin.materials.film else None
+        film = effects.get("film") if twin.film else None
         return cls(
             L0=twin.light.L0,
             n=twin.light.n,

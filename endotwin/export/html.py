@@ -70,8 +70,8 @@ def _vertices(twin: Twin, low: np.ndarray, extent: np.ndarray) -> np.ndarray:
 
 def _wet(twin: Twin) -> np.ndarray:
     """The film on each vertex, WET [V]; [0] without one."""
-    film, count = twin.materials.film, len(twin.surface.vertices_mm)
-    if film is None or "film" not in twin.effects:
+    film, count = twin.film, len(twin.surface.vertices_mm)
+    if film is None:
         return np.zeros(0, WET)
     rows = np.zeros(count, WET)
     rows["facing"] = film.on_all(np.rint(32767 * _folded(film.normal)), count)

@@ -82,7 +82,7 @@ def _mesh(twin: Twin, look: Appearance, scale: int) -> bytes:
     places, normals = world_vertices_mm(twin), twin.surface.normals
     triangles, row, film = twin.surface.triangles, slice(None), {}
     if look.film_f0:
-        triangles, row, film = _wet(twin.materials.film, twin.surface, scale * look.film_f0)
+        triangles, row, film = _wet(twin.film, twin.surface, scale * look.film_f0)
     columns = {**named("", places[row], "xyz"), **named("n", normals[row], "xyz")}
     columns |= named("base_color_", scale * diffuse_color(twin)[row], "012")
     columns["roughness_0"] = np.maximum(twin.materials.roughness[row], ROUGHNESS_MIN)
@@ -106,9 +106,7 @@ def _wet(film: Film, surface: Surface, f0: float) -> tuple[np.ndarray, np.ndarra
     level = surface.normals + 0.0
     level[film.vertex] = film.normal
     wettest = np.take_along_axis(corners, weight[corners].argmax(axis=1)[:, None], axis=1)
-    own = np.where(
-        weight[corners] > 0, corners, wettest
-    )  # a dry corner levels off as the wettest of its triangle does
+    own = np.where(weight[corners] > 0, corners, wettest)  # a dry corner levels off as the wettest one
     first = surface.vertices_mm[corners[:, 1]] - surface.vertices_mm[corners[:, 0]]
     along = np.repeat(first, 3, axis=0)
     facing = surface.normals[corners.ravel()]

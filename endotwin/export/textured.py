@@ -106,7 +106,7 @@ def textured(twin: Twin) -> Textured:
 def _film(twin: Twin) -> list[np.ndarray]:
     """Weight [V, 1] of the film and normals [V, 3] of no unit length, so that dry vertices count for nothing
     beside wet ones; none without a film."""
-    if "film" not in twin.effects or (film := twin.materials.film) is None:
+    if (film := twin.film) is None:
         return []
     count = len(twin.surface.vertices_mm)
     weight, normal = film.on_all(film.weight, count), film.on_all(film.weight[:, None] * film.normal, count)

@@ -24,7 +24,7 @@ from endotwin.cameras import Camera
 from endotwin.effects import Decision
 from endotwin.effects.film import Film as FilmEffect
 from endotwin.fit.gauss_newton import State
-from endotwin.fit.lighting import Relighting, exposed, lit
+from endotwin.fit.lighting import Relighting, lit
 from endotwin.fit.model import at_pixels, radiance
 from endotwin.light import shading
 from endotwin.light.film import Film, mirrored, mirrors_in_view
@@ -92,10 +92,7 @@ class Model:
         def decided(state: str, reason: str, gain_db: float) -> Decision:
             return Decision(state, reason, round(gain_db, 3), round(time.perf_counter() - began, 3))
 
-        samples = samples.thinned(JUDGES, np.random.default_rng(0))
-        if samples.log_exposure is not None:
-            samples = exposed(samples, self.relighting.effects)  # whose gain has changed since
-        judges = self.based(samples)
+        judges = self.based(samples.thinned(JUDGES, np.random.default_rng(0)))
         most_db = judges.most_db()
         if not judges.shines.any() or (wanted == "auto" and most_db < LEAST_DB):
             return None, None, decided("off", f"glints beyond the model cost {most_db:.2f} dB", most_db)
@@ -116,9 +113,9 @@ class Model:
         return film, FilmEffect(roughness=roughness), decided("on", reason, gain_db)
 
     def based(self, samples: Samples) -> Based:
-        """``samples``, which are lit, with what the model shows there."""
+        """``samples``, which the guides light, with what the model shows there."""
         triangles = torch.from_numpy(self.twin.surface.triangles.astype(np.int64))
-        samples = self.relighting.bounced(samples, triangles, self.state)
+        samples = self.relighting.relit(samples, triangles, self.state)
         material = at_pixels(samples, triangles, self.state.materials)
         return Based(self, samples, radiance(samples, material, self.state.shared))
 

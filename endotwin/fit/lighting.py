@@ -112,16 +112,13 @@ class Relighting:
 
     def __call__(self, solver: GaussNewton, state: State) -> None:
         """Relight the samples of ``solver`` as ``state`` says."""
-        materials = state.materials
-        samples = self.bounced(solver.samples, solver.triangles, state)
-        if "gain" in self.effects:
+        samples = self.relit(solver.samples, solver.triangles, state)
+        if "gain" in self.effects and state.textured:
+            solver.relight(samples)
+            width = HUBER * solver.noise(state)
+            material = at_pixels(samples, solver.triangles, state.materials)
+            self.effects = regained(samples, material, state.shared, self.effects, width)
             samples = exposed(samples, self.effects)
-            if state.textured:
-                solver.relight(samples)
-                width = HUBER * solver.noise(state)
-                material = at_pixels(samples, solver.triangles, materials)
-                self.effects = regained(samples, material, state.shared, self.effects, width)
-                samples = exposed(samples, self.effects)
         if self.needed:
             solver.relight(samples)
 

@@ -121,7 +121,8 @@ def fit_twin(
             "check that poses and depth fit it"
         )
     with stopwatch.stage("start"):
-        telling = np.flatnonzero(_telling(samples, surface))
+        smooth, clipped = _smooth(samples, surface), samples.color.amax(dim=1).numpy() >= BRIGHT
+        telling = np.flatnonzero(smooth & ~clipped)
         if not len(telling):
             telling = np.arange(len(samples))
             if int(samples.color.amax(dim=1).min()) >= BRIGHT:
@@ -151,11 +152,10 @@ def fit_twin(
         wanted = states.get("coat", "auto") if "specular" in decided.effects else "off"
         count = min(LIGHT_PIXELS, int(LIGHT_SHARE * pace.start_pixels))
         rows = telling[torch.from_numpy(drawn(len(telling), count, np.random.default_rng(seed)))]
-        clipped = torch.from_numpy(np.flatnonzero(_telling(samples, surface, clipped=True)))
-        clipped = clipped[
-            drawn(len(clipped), len(clipped) * len(rows) // len(every), np.random.default_rng(seed))
-        ]
-        parts = samples[rows], samples[clipped]
+        glints = np.flatnonzero(smooth & clipped)
+        count = len(glints) * len(rows) // len(every)
+        glints = glints[drawn(len(glints), count, np.random.default_rng(seed))]
+        parts = samples[rows], samples[torch.from_numpy(glints)]
         state, cost, coat = _find_light(*parts, surface, start, pace, relighting, wanted, device)
     with stopwatch.stage("detail"):
         state, normals, left = _find_detail(samples, twin, state, cost, pace, relighting, device)
@@ -189,10 +189,10 @@ def _without_bounce(decision: Decision) -> Decision:
     return replace(decision, reason=f"{decision.reason}; but the fit finds none of it: strength 0")
 
 
-def _telling(samples: Samples, surface: Surface, clipped: bool = False) -> np.ndarray:
-    """Bool [N]: samples off the creases of the surface and below saturation; or, ``clipped``, in it."""
+def _smooth(samples: Samples, surface: Surface) -> np.ndarray:
+    """Bool [N]: samples off the creases of the surface."""
     smooth = surface.normal_agreement() > np.cos(np.radians(CERTAIN_NORMAL_DEG))
-    return smooth[samples.triangle.numpy()] & ((samples.color.amax(dim=1).numpy() >= BRIGHT) == clipped)
+    return smooth[samples.triangle.numpy()]
 
 
 def _find_light(

@@ -103,7 +103,7 @@ class Samples:
         return self._each(lambda value: value.to(device))
 
     @classmethod
-    def joined(cls, parts: list[Samples], views: Views) -> Samples:
+    def joined(cls, parts: list[Samples], views: Views | None = None) -> Samples:
         """The samples of all ``parts``, in their order."""
         return _joined([replace(part, views=None) for part in parts], views=views)
 
@@ -186,11 +186,11 @@ def gather(twin: Twin, pace: Pace, seed: int, caster: Caster) -> Samples:
         if len(part) and not tells and any(shows):
             logger.warning("%s is black or clipped and is not fitted", sequence.color_files[index])
     parts = [part for part, tells in zip(parts, shows, strict=True) if tells or not any(shows)]
-    shown = np.unique(torch.cat([part.frame for part in parts]).numpy())
+    joined = Samples.joined(parts)
+    shown = np.unique(joined.frame.numpy())
     T_local_camera = twin.surface.to_local(sequence.T_world_camera[shown])
     views = Views(twin.camera, sequence.lens_mask, shown, T_local_camera)
-    joined = Samples.joined(parts, views)
-    return joined[torch.argsort(joined.triangle, stable=True)]
+    return replace(joined[torch.argsort(joined.triangle, stable=True)], views=views)
 
 
 def _shown(part: Samples) -> float:

@@ -67,8 +67,8 @@ class Illumination:
 
     def _mirrored(self, T_local_camera: np.ndarray) -> np.ndarray | None:
         """Radiance that the film at each vertex sends to the camera, float32 [V]; None without a film."""
-        twin, effects, film = self.twin, self.twin.effects, self.twin.materials.film
-        if film is None or "film" not in effects:
+        twin, effects, film = self.twin, self.twin.effects, self.twin.film
+        if film is None:
             return None
         half, strength = mirrors_in_view(
             twin.surface.vertices_mm[film.vertex],

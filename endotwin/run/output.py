@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import errno
 import filecmp
+import json
 import os
 import re
 import shutil
@@ -194,6 +195,22 @@ def move_folder(new: Path, path: Path, own: Callable[[Path], bool]) -> None:
                 raise
 
 
+def goes_on(work: Path, mark: str, asked: dict, another: str) -> bool:
+    """Whether the folder ``work`` holds what a run has done so far that ``asked`` the same, as its file
+    ``mark`` says. A folder whose place another has taken is removed.
+
+    Raises:
+        OutputError: it holds the results of ``another`` run.
+    """
+    if was_replaced(work):
+        shutil.rmtree(work)
+    if not (work / mark).exists():
+        return False
+    if json.loads((work / mark).read_text(encoding="utf-8")) != asked:
+        raise OutputError(f"{work} holds the results of {another}; delete it or choose another -o")
+    return True
+
+
 def was_replaced(folder: Path) -> bool:
     """Whether another folder has taken the place of ``folder``, in a run that was killed before it removed
     this one."""
@@ -269,8 +286,8 @@ def _settle(place: Path) -> None:
 def _workplace(folder: Path) -> Iterator[Path]:
     """A hidden folder in ``folder`` to write in, gone after the block, as are those of runs that were
     killed."""
-    sweep(folder)
     with _locked(folder):
+        _remove_left(folder)
         work = Path(tempfile.mkdtemp(prefix=HIDDEN, dir=folder))
         held = locks.take(work)
     try:
@@ -283,8 +300,12 @@ def _workplace(folder: Path) -> Iterator[Path]:
 def sweep(folder: Path) -> None:
     """Remove what runs that were killed left half written in ``folder``."""
     with _locked(folder):
-        for left in folder.glob(f"{HIDDEN}*/"):
-            _remove_abandoned(left)
+        _remove_left(folder)
+
+
+def _remove_left(folder: Path) -> None:
+    for left in folder.glob(f"{HIDDEN}*/"):
+        _remove_abandoned(left)
 
 
 def _remove_abandoned(work: Path) -> None:

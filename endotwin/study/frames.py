@@ -19,7 +19,7 @@ from endotwin.sequence import Sequence
 from endotwin.sequence.sequence import resized_depth
 from endotwin.study.accuracy import FARTHEST_MM
 from endotwin.study.corruptions import as_jpeg
-from endotwin.synth.encodings import UINT16
+from endotwin.synth.encodings import decode_depth, pixels
 from endotwin.synth.labels import MASK_UNSEEN
 
 COLOR, DEPTH, ASKED = "color.npy", "depth.npy", "asked.json"
@@ -90,25 +90,19 @@ def of_dataset(
 
     shards = sorted(str(file) for file in folder.glob("shard-*.tar"))
     for index, frame in enumerate(webdataset.WebDataset(shards, shardshuffle=False)):
-        color = _decoded(frame["rgb.png"], cv2.IMREAD_COLOR)[..., ::-1]
+        color = pixels(frame["rgb.png"])
         if codec:
             quality = np.random.default_rng(index).integers(codec[0], codec[1] + 1)
             color = as_jpeg(color, int(quality))
-        raw = _decoded(frame["depth.tiff"], cv2.IMREAD_UNCHANGED)
-        known = (
-            (raw > 0) & (raw < UINT16) & (_decoded(frame["mask.png"], cv2.IMREAD_UNCHANGED) >= MASK_UNSEEN)
-        )
-        depth_mm = np.where(known, raw * np.float32(FARTHEST_MM / UINT16), np.nan)
+        depth_mm = decode_depth(frame["depth.tiff"])
+        known = np.isfinite(depth_mm) & (pixels(frame["mask.png"]) >= MASK_UNSEEN)
+        depth_mm = np.where(known, depth_mm, np.nan).astype(np.float32)
         yield shrunk(color, size) * lit[..., None], np.where(lit, resized_depth(depth_mm, *size), np.nan)
 
 
 def shrunk(color: np.ndarray, size: Size) -> np.ndarray:
     """A photo uint8 [h, w, 3] at ``size``, each pixel the mean of what it covers."""
     return cv2.resize(np.ascontiguousarray(color), size, interpolation=cv2.INTER_AREA)
-
-
-def _decoded(content: bytes, how: int) -> np.ndarray:
-    return cv2.imdecode(np.frombuffer(content, np.uint8), how)
 
 
 def kept(frames: Iterator[Frame], count: int, size: Size, folder: Path, asked: dict) -> Frames:

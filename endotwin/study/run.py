@@ -18,7 +18,16 @@ import torch
 from endotwin import pipeline
 from endotwin.cameras import Camera
 from endotwin.errors import OptionError, OutputError, TwinError
-from endotwin.run.output import DATASET, STUDY, check_apart, check_free, move_folder, unwritable, whole_file
+from endotwin.run.output import (
+    DATASET,
+    STUDY,
+    check_apart,
+    check_free,
+    goes_on,
+    move_folder,
+    unwritable,
+    whole_file,
+)
 from endotwin.run.threads import device_of
 from endotwin.sequence import Sequence
 from endotwin.sequence.readers import open_sequence
@@ -172,17 +181,12 @@ class _Experiment:
             "steps": self.steps,
             "loss": self.plan.loss,
         }
-        question = self.work / STUDY
-        if question.exists() and _read(question) != asked:
-            raise OutputError(
-                f"{self.work} holds the results of another study; delete it or choose another -o"
-            )
         done = self.out / STUDY
-        if not question.exists() and done.exists() and _read(done) == asked:  # and more parts are wanted
-            shutil.copytree(self.out, self.work)
+        if not goes_on(self.work, STUDY, asked, "another study") and done.exists() and _read(done) == asked:
+            shutil.copytree(self.out, self.work)  # more parts are wanted
         for folder in ("results", "networks", "recipes", "datasets", "frames"):
             (self.work / folder).mkdir(parents=True, exist_ok=True)
-        _keep(asked, question)
+        _keep(asked, self.work / STUDY)
 
     # What is trained and tested on
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import platform
 import shutil
@@ -10,7 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from endotwin.errors import OutputError
-from endotwin.run.output import TRADEOFF, check_free, move_folder, unwritable, was_replaced
+from endotwin.run.output import TRADEOFF, check_free, goes_on, move_folder, unwritable
 from endotwin.sequence import Sequence
 from endotwin.sequence.readers import open_sequence
 from endotwin.tradeoff import crops, effects, plot, report
@@ -120,18 +119,11 @@ def _climbed(
 
 def _enter(work: Path, asked: dict) -> None:
     """Make the working folder, or go on in it if it was made for the same sequence and geometry."""
-    question = work / TRADEOFF
-    if was_replaced(work):
-        shutil.rmtree(work)
-    if question.exists():
-        if json.loads(question.read_text(encoding="utf-8")) != asked:
-            raise OutputError(
-                f"{work} holds the results of another sequence or geometry; delete it or choose another -o"
-            )
+    if goes_on(work, TRADEOFF, asked, "another sequence or geometry"):
         return
     for folder in ("rungs", "results", "crops"):
         (work / folder).mkdir(parents=True, exist_ok=True)
-    keep(asked, question)
+    keep(asked, work / TRADEOFF)
 
 
 def _measure(

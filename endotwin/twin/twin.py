@@ -185,6 +185,11 @@ class Twin:
     def fitted(self) -> bool:
         return self.materials is not None
 
+    @property
+    def film(self) -> Film | None:
+        """The film of fluid that is seen; None without one, or without the effect."""
+        return self.materials.film if self.fitted and "film" in self.effects else None
+
     def __repr__(self) -> str:
         lines = [repr(self.surface), f"camera: {self.camera.model} {self.camera.width}×{self.camera.height}"]
         if self.fitted:
