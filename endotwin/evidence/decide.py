@@ -10,7 +10,7 @@ Profile and vignetting, which say little, follow beside what was kept.
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import cache
 from itertools import combinations
@@ -26,6 +26,7 @@ from endotwin.effects.shadows import Shadows
 from endotwin.effects.specular import Specular
 from endotwin.effects.vignetting import Vignetting
 from endotwin.evidence.bounce import bounced, cell_mm
+from endotwin.evidence.glints import Glints
 from endotwin.evidence.guide_search import Guides, Search, found_guides
 from endotwin.evidence.probe import MIN_IMPOSSIBLE_DB, Bounced, Fitted, Hypothesis, Probe, Verdict
 from endotwin.light.guides import AT_LENS, COSINE, EXPONENTIAL
@@ -63,14 +64,17 @@ class Decided:
     gamma: float
 
 
-def decide(samples: Samples, twin: Twin, caster: Caster, wanted: Mapping[str, str]) -> Decided:
+def decide(
+    samples: Samples, twin: Twin, caster: Caster, glints: Callable[[], Glints], wanted: Mapping[str, str]
+) -> Decided:
     """Decide the effects of the light from ``samples`` that tell it.
 
     Args:
+        glints: those of the photos, looked for where guides are sought.
         wanted: auto, on or off by name of the effect; auto unless given.
     """
     probe = Probe(samples, twin, caster)
-    trial = _Trial(probe, wanted)
+    trial = _Trial(probe, glints, wanted)
     kept = trial.together()
     kept = trial.shadowed(kept)
     for name in BESIDE:
@@ -81,8 +85,8 @@ def decide(samples: Samples, twin: Twin, caster: Caster, wanted: Mapping[str, st
 class _Trial:
     """Sets of effects about one probe, and what was decided of each effect."""
 
-    def __init__(self, probe: Probe, wanted: Mapping[str, str]):
-        self._probe, self._wanted = probe, wanted
+    def __init__(self, probe: Probe, glints: Callable[[], Glints], wanted: Mapping[str, str]):
+        self._probe, self._glints, self._wanted = probe, cache(glints), wanted
         self._decisions: dict[str, Decision] = {}
         self._seconds = dict.fromkeys((*TOGETHER, *BESIDE), 0.0)
         self._model, self._bouncing = cache(self._fitted), cache(self._bounced)
@@ -98,7 +102,8 @@ class _Trial:
         if self.wanted("offset") != "off" and len(self._probe):
             began = time.perf_counter()
             base = replace(self._model(best).hypothesis, vignetting=self.wanted("vignetting") != "off")
-            self._guides_mm = found_guides(self._probe, base, self.wanted("offset") == "on")
+            forced = self.wanted("offset") == "on"
+            self._guides_mm = found_guides(self._probe, base, self._glints(), forced)
             self._seconds["offset"] += time.perf_counter() - began
         sets = self._sets(TOGETHER) if self._guides_mm != AT_LENS else lens
         kept, verdicts = self._pruned(self._best(sets))
@@ -131,7 +136,7 @@ class _Trial:
         worth = verdict.worth(LEAST_VIGNETTING) if name == "vignetting" else verdict.keep
         on = self.wanted(name) == "on" or worth
         if on and other.hypothesis.guides_mm != AT_LENS:
-            polished_mm = Search.of(self._probe, other.hypothesis).polished()
+            polished_mm = Search.of(self._probe, other.hypothesis, self._glints()).polished()
             other = self._probe.fit(replace(other.hypothesis, guides_mm=polished_mm))
         self._say(name, on, verdict)
         self._seconds[name] += time.perf_counter() - began
@@ -222,7 +227,8 @@ class _Trial:
     def _mixed(self, kept: Fitted) -> Hypothesis:
         """Beside ``kept``, the profile at the foot of the parabola through the losses of three."""
         profiles = (COSINE, (COSINE + EXPONENTIAL) / 2, EXPONENTIAL)
-        losses = [self._probe.loss(replace(kept.hypothesis, profile=p), kept) for p in profiles]
+        left = [self._probe.residuals(replace(kept.hypothesis, profile=p), kept) for p in profiles]
+        losses = [float((each**2).sum()) for each in left]
         bend, slope, _ = np.polyfit(profiles, losses, 2)
         foot = -slope / (2 * bend) if bend > 0 else profiles[int(np.argmin(losses))]
         return replace(kept.hypothesis, profile=float(np.clip(foot, COSINE, EXPONENTIAL)))

@@ -6,8 +6,9 @@ from dataclasses import replace
 from functools import cache
 
 import numpy as np
-from scipy.optimize import minimize
+from scipy.optimize import least_squares, minimize
 
+from endotwin.evidence.glints import Glints
 from endotwin.evidence.probe import Hypothesis, Probe
 from endotwin.light.guides import AT_LENS
 
@@ -24,10 +25,13 @@ MOST_GUIDES = 3
 SEARCH_PIXELS = 8_000
 """Guides are sought with so many pixels of the probe."""
 
-REFINE_STEPS, SPREAD = 50, 0.2
-POLISH_STEPS, POLISH_SPREAD = 60, 0.05
+STEPS, POLISH_STEPS = 12, 30
 TOLERANCE = 1e-3
-"""The search ends when positions move by less than this share of the ring's radius, and the loss by less."""
+"""The search ends when positions move by less than this share of the ring's radius, or the loss by less."""
+
+ASIDE, POLISH_ASIDE = 0.1, 0.05
+"""Of the ring's radius: by so much guides are moved to find what their positions change. With less, the
+shadows that jump from pixel to pixel hide it."""
 
 
 def ring_mm(probe: Probe, share: float = 1.0) -> np.ndarray:
@@ -37,14 +41,14 @@ def ring_mm(probe: Probe, share: float = 1.0) -> np.ndarray:
     return (radius_mm * np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)).astype(np.float32)
 
 
-def found_guides(probe: Probe, base: Hypothesis, forced: bool) -> Guides:
+def found_guides(probe: Probe, base: Hypothesis, glints: Glints, forced: bool) -> Guides:
     """Positions of one to three guides that predict held-out pixels better than ``base``, camera frame; the
-    lens where none do.
+    lens where none do. They are sought where they explain the ``glints`` as well.
 
     One guide, and a glance at two and three, tell whether a search is worth its time. With ``forced`` there
     is always a position: that of the most guides, if none is worth it.
     """
-    search = Search.of(probe, base)
+    search = Search.of(probe, base, glints)
     if not forced and not search.hints():
         return AT_LENS
     plain, best, guides_mm = probe.fit(base), None, ()
@@ -54,14 +58,14 @@ def found_guides(probe: Probe, base: Hypothesis, forced: bool) -> Guides:
         last = forced and best is None and number == MOST_GUIDES
         if last or probe.compare(best or plain, found).keep:
             best = found
-    return AT_LENS if best is None else Search.of(probe, best.hypothesis).polished()
+    return AT_LENS if best is None else Search.of(probe, best.hypothesis, glints).polished()
 
 
 class Search:
-    """Guide positions that predict a probe's pixels best, shadows included."""
+    """Guide positions that predict a probe's pixels best, shadows included, and where its glints lie."""
 
-    def __init__(self, probe: Probe, base: Hypothesis):
-        self._probe, self._base = probe, probe.fit(base)
+    def __init__(self, probe: Probe, base: Hypothesis, glints: Glints):
+        self._probe, self._base, self._glints = probe, probe.fit(base), glints
         self._candidates = np.concatenate([ring_mm(probe, share) for share in RING_RADII])
         seen = [probe.visible(guide) for guide in self._candidates]
         self._at_risk = np.flatnonzero(~np.logical_and.reduce(seen))
@@ -69,16 +73,19 @@ class Search:
         self.best = cache(self._best)
 
     @classmethod
-    def of(cls, probe: Probe, base: Hypothesis) -> Search:
+    def of(cls, probe: Probe, base: Hypothesis, glints: Glints) -> Search:
         """A search with some of the probe's pixels, beside the other effects of ``base``."""
         part, rows = probe.part(SEARCH_PIXELS)
-        return cls(part, base if base.bounced is None else replace(base, bounced=base.bounced[rows]))
+        base = base if base.bounced is None else replace(base, bounced=base.bounced[rows])
+        return cls(part, base, glints)
 
     def hints(self) -> bool:
         """Whether one guide, wherever it is best, or two or three about the lens predict better."""
         alone = np.array(self.best(()))
-        about = [min(self._about(number), key=self._loss) for number in range(2, MOST_GUIDES + 1)]
-        models = [self._probe.fit(self._with(guides_mm)) for guides_mm in (alone, *about)]
+        more = range(2, MOST_GUIDES + 1)
+        about = [min(self._about(number), key=self._loss) for number in more]
+        told = [self._glints.guides_mm(number) for number in more]
+        models = [self._probe.fit(self._with(each)) for each in (alone, *about, *told) if len(each)]
         return any(self._probe.compare(self._base, model).hints for model in models)
 
     def _best(self, fewer_mm: Guides) -> Guides:
@@ -88,7 +95,8 @@ class Search:
         for moved in range(len(known)):
             others = np.delete(start_mm, moved, axis=0)
             start_mm = min([start_mm, *self._joined(others)], key=self._loss)
-        return self._refined(start_mm, REFINE_STEPS, SPREAD)
+        starts_mm = [start_mm, self._glints.guides_mm(len(start_mm))]
+        return min((self._refined(each) for each in starts_mm if len(each)), key=self._loss)
 
     def _about(self, number: int) -> list[np.ndarray]:
         """``number`` guides about the lens, on one ring, evenly apart as nearly as its points allow."""
@@ -103,32 +111,47 @@ class Search:
 
     def polished(self) -> Guides:
         """The base's own guides, moved to where they predict best beside all that was kept since."""
-        return self._refined(np.asarray(self._base.hypothesis.guides_mm), POLISH_STEPS, POLISH_SPREAD)
-
-    def _refined(self, start_mm: np.ndarray, steps: int, spread: float) -> Guides:
-        """Guides moved from ``start_mm`` [K, 3] by ``steps`` trials each, first by ``spread`` of the ring."""
-        first = start_mm[:, :2].astype(np.float64).ravel() / self._radius_mm
-        found = minimize(
-            lambda x: self._loss(self._guides(x)),
-            first,
-            method="Nelder-Mead",
-            options={
-                "maxfev": steps * len(start_mm),
-                "xatol": TOLERANCE,
-                "fatol": TOLERANCE * self._loss(self._guides(first)),
-                "initial_simplex": np.vstack([first, first + spread * np.eye(len(first))]),
-            },
-        )
+        first = self._plane(self._refined(self._base.hypothesis.guides_mm))
+        options = {
+            "maxfev": POLISH_STEPS * len(first) // 2,
+            "xatol": TOLERANCE,
+            "fatol": TOLERANCE * self._loss(self._guides(first)),
+            "initial_simplex": np.vstack([first, first + POLISH_ASIDE * np.eye(len(first))]),
+        }
+        found = minimize(lambda x: self._loss(self._guides(x)), first, method="Nelder-Mead", options=options)
         return _plain(self._guides(found.x))
+
+    def _refined(self, start_mm: Guides | np.ndarray) -> Guides:
+        """Guides moved from ``start_mm`` [K, 3] in the plane of the lens by Gauss–Newton."""
+
+        def residuals(x: np.ndarray) -> np.ndarray:
+            return self._residuals(self._guides(x))
+
+        def slopes(x: np.ndarray) -> np.ndarray:
+            aside = [residuals(x + step) - residuals(x - step) for step in ASIDE * np.eye(len(x))]
+            return np.stack(aside, axis=1) / (2 * ASIDE)
+
+        first = self._plane(start_mm)
+        found = least_squares(residuals, first, slopes, xtol=TOLERANCE, ftol=TOLERANCE, max_nfev=STEPS)
+        return _plain(self._guides(found.x))
+
+    def _plane(self, guides_mm: Guides | np.ndarray) -> np.ndarray:
+        """x and y of K guides in ring's radii, [2K]."""
+        return np.asarray(guides_mm, np.float64)[:, :2].ravel() / self._radius_mm
 
     def _guides(self, x: np.ndarray) -> np.ndarray:
         return np.c_[x.reshape(-1, 2), np.zeros(len(x) // 2)].astype(np.float32) * np.float32(self._radius_mm)
 
     def _loss(self, guides_mm: np.ndarray) -> float:
+        return float((self._residuals(np.asarray(guides_mm)) ** 2).sum()) / 2
+
+    def _residuals(self, guides_mm: np.ndarray) -> np.ndarray:
+        """Of the pixels under these guides, and of the glints among as many."""
         visible = np.ones((len(self._probe), len(guides_mm)), bool)
         for k, guide in enumerate(guides_mm):
             visible[self._at_risk, k] = self._probe.visible(guide, self._at_risk)
-        return self._probe.loss(self._with(guides_mm), self._base, visible)
+        diffuse = self._probe.residuals(self._with(guides_mm), self._base, visible)
+        return np.r_[diffuse, self._glints.residuals(guides_mm, len(self._probe))]
 
     def _with(self, guides_mm: np.ndarray) -> Hypothesis:
         return replace(self._base.hypothesis, guides_mm=_plain(guides_mm), shadows=True)

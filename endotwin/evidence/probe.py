@@ -18,7 +18,7 @@ import torch
 
 from endotwin.effects.vignetting import squared_radius
 from endotwin.light.guides import AT_LENS, COSINE, guided, log_axis, visible_from
-from endotwin.pixels.fixed_effects import Design, FixedEffects, regress, robust_losses
+from endotwin.pixels.fixed_effects import Design, FixedEffects, regress, robust_losses, robust_residuals
 from endotwin.pixels.start import LIGHT_MEAN, LIGHT_SPREAD, PRIOR, diffuse
 from endotwin.surface.vectors import unit
 
@@ -244,12 +244,14 @@ class Probe:
                 n, q = found.n, found.q
         return found
 
-    def loss(self, hypothesis: Hypothesis, base: Fitted, visible: np.ndarray | None = None) -> float:
-        """Robust loss of all pixels, linearised about ``base``, under guides that see them as ``visible`` [N,
-        K] says (found out unless given)."""
+    def residuals(
+        self, hypothesis: Hypothesis, base: Fitted, visible: np.ndarray | None = None
+    ) -> np.ndarray:
+        """Robust residuals [N], in widths of those of ``base``, linearised about it, under guides that see
+        the pixels as ``visible`` [N, K] says (found out unless given)."""
         design = self._design(hypothesis, self._light(hypothesis, visible).columns(base.n, base.q))
         found = regress(self.target, design, len(self.frames), rounds=2)
-        return float(robust_losses(self.target, design, found, base.effects.width).sum())
+        return robust_residuals(self.target, design, found, base.effects.width)
 
     def compare(self, base: Fitted, other: Fitted) -> Verdict:
         """How much better ``other`` predicts pixels of vertices that did not choose its coefficients."""

@@ -19,6 +19,7 @@ from endotwin.effects import Decision, Effects
 from endotwin.errors import SequenceError
 from endotwin.evidence.coat import judged as judged_coat
 from endotwin.evidence.decide import decide
+from endotwin.evidence.glints import Glints
 from endotwin.fit.film import Model
 from endotwin.fit.gauss_newton import (
     CPU,
@@ -137,7 +138,11 @@ def fit_twin(
         logger.warning("the photos cannot tell %s: kept at the prior", " and ".join(start.undetermined))
     with stopwatch.stage("effects"):
         caster = caster.threaded(THREADS)
-        decided = decide(samples[every], twin, caster, states)
+
+        def glints() -> Glints:
+            return Glints.of(samples[torch.from_numpy(smooth)], surface, start)
+
+        decided = decide(samples[every], twin, caster, glints, states)
         relighting = Relighting(surface, caster, decided.effects, samples.views)
         if decided.light is not None:
             start = start_at(

@@ -109,8 +109,14 @@ def _normal_equations(
     return full, np.r_[right, sums[-1][1:]]
 
 
+def robust_residuals(target: np.ndarray, design: Design, found: FixedEffects, width: float) -> np.ndarray:
+    """What is left [N] beside what was ``found``, each group at its own mean, in units of ``width``;
+    shortened so that half its square is the pseudo-Huber loss."""
+    left = (target - design.explained(found))[:, None]
+    residual = without_means(left, np.ones(len(target)), design.group, design.count)[:, 0] / width
+    return np.sign(residual) * np.sqrt(2 * (np.sqrt(1 + residual**2) - 1))
+
+
 def robust_losses(target: np.ndarray, design: Design, found: FixedEffects, width: float) -> np.ndarray:
     """Pseudo-Huber losses [N] of what was ``found``, each group at its own mean."""
-    left = (target - design.explained(found))[:, None]
-    residual = without_means(left, np.ones(len(target)), design.group, design.count)[:, 0]
-    return width**2 * (np.sqrt(1 + (residual / width) ** 2) - 1)
+    return width**2 / 2 * robust_residuals(target, design, found, width) ** 2

@@ -2,6 +2,7 @@
 
 import os
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -11,10 +12,12 @@ import torch
 from endotwin.config import STANDARD
 from endotwin.effects.vignetting import Vignetting
 from endotwin.evidence.decide import decide
+from endotwin.evidence.glints import Glints
 from endotwin.evidence.probe import Hypothesis, Probe
 from endotwin.pipeline import fuse_twin
 from endotwin.pixels.pace import Pace
 from endotwin.pixels.samples import gather
+from endotwin.pixels.start import closed_form
 from endotwin.surface.casting import Caster
 
 pytestmark = pytest.mark.slow
@@ -26,13 +29,20 @@ LIGHT = ("offset", "shadows", "interreflection", "gain", "vignetting", "profile"
 
 
 def scene(path: Path, scale: float):
-    """A fused twin of the sequence, a caster of its mesh, and the pixels that a fit would look at."""
+    """A fused twin of the sequence, a caster of its mesh, the pixels that a fit would look at, and their
+    glints."""
     twin = fuse_twin(path, scale=scale)
     caster = Caster(twin.surface)
     samples = gather(twin, Pace(STANDARD.fit), 0, caster)
     smooth = twin.surface.normal_agreement() > np.cos(np.radians(5))
-    telling = smooth[samples.triangle.numpy()] & (samples.color.numpy().max(axis=1) < 250)
-    return twin, caster, samples[torch.from_numpy(np.flatnonzero(telling))]
+    smooth = samples[torch.from_numpy(smooth[samples.triangle.numpy()])]
+    telling = smooth[smooth.color.amax(dim=1) < 250]
+
+    def glints() -> Glints:
+        start = closed_form(telling, twin.surface.triangles, len(twin.surface.vertices_mm))
+        return Glints.of(smooth, twin.surface, start)
+
+    return twin, caster, telling, cache(glints)
 
 
 @pytest.fixture(scope="module")
@@ -53,14 +63,14 @@ def brightened(samples, log_gain: np.ndarray):
 
 
 def test_a_scene_lit_as_in_the_paper_calls_for_no_effect(example):
-    twin, caster, samples = example
-    assert set(states(decide(samples, twin, caster, {})).values()) == {"off"}
+    twin, caster, samples, glints = example
+    assert set(states(decide(samples, twin, caster, glints, {})).values()) == {"off"}
 
 
 def test_gain_is_found_to_a_hundredth(example):
-    twin, caster, samples = example
+    twin, caster, samples, glints = example
     log_gain = np.random.default_rng(3).normal(0, 0.15, 64)
-    decided = decide(brightened(samples, log_gain), twin, caster, {})
+    decided = decide(brightened(samples, log_gain), twin, caster, glints, {})
     assert states(decided) == {**dict.fromkeys(LIGHT, "off"), "gain": "on"}
     gain = decided.effects["gain"]
     true = log_gain[list(gain.frames)]
@@ -68,7 +78,7 @@ def test_gain_is_found_to_a_hundredth(example):
 
 
 def test_an_effect_that_gains_little_is_not_kept_beside_a_light_that_no_endoscope_has(example):
-    twin, caster, samples = example
+    twin, caster, samples, _ = example
     log_gain = np.random.default_rng(3).normal(0, 0.02, 64)
     probe = Probe(brightened(samples, log_gain), twin, caster)
     plain, gained = probe.fit(Hypothesis()), probe.fit(Hypothesis(gain=True))
@@ -78,28 +88,28 @@ def test_an_effect_that_gains_little_is_not_kept_beside_a_light_that_no_endoscop
 
 
 def test_a_profile_that_is_no_cosine_is_found(example):
-    twin, caster, samples = example
+    twin, caster, samples, glints = example
     cos_axis = samples.log_cos_axis.exp().numpy()
     factor = (np.exp(-4 * (1 - cos_axis)) / cos_axis**2) ** (1 / 2.2)
     color = np.uint8(np.clip(samples.color.numpy() * factor[:, None], 0, 255) + 0.5)
-    decided = decide(replace(samples, color=torch.from_numpy(color)), twin, caster, {})
+    decided = decide(replace(samples, color=torch.from_numpy(color)), twin, caster, glints, {})
     assert states(decided) == {**dict.fromkeys(LIGHT, "off"), "profile": "on"}
     assert decided.light.n == pytest.approx(4, rel=0.05)
     assert decided.effects["profile"].exponential == pytest.approx(1, abs=0.1)
 
 
 def test_a_profile_forced_on_a_cosine_stays_one(example):
-    twin, caster, samples = example
-    decided = decide(samples, twin, caster, {"profile": "on"})
+    twin, caster, samples, glints = example
+    decided = decide(samples, twin, caster, glints, {"profile": "on"})
     assert states(decided) == {**dict.fromkeys(LIGHT, "off"), "profile": "on"}
     assert decided.effects["profile"].exponential == pytest.approx(0, abs=0.1)
     assert decided.light.n == pytest.approx(2, rel=0.05)
 
 
 def test_an_effect_that_is_forced_off_stays_off(example):
-    twin, caster, samples = example
+    twin, caster, samples, glints = example
     log_gain = np.random.default_rng(3).normal(0, 0.15, 64)
-    decided = decide(brightened(samples, log_gain), twin, caster, {"gain": "off"})
+    decided = decide(brightened(samples, log_gain), twin, caster, glints, {"gain": "off"})
     assert decided.decisions["gain"].state == "off"
     assert decided.decisions["gain"].reason == "forced off"
 
@@ -127,9 +137,9 @@ def test_guides_are_found_within_half_a_millimetre_with_their_shadows(lit_from_b
 
 @needs_data
 def test_vignetting_and_guides_are_told_apart(lit_from_beside):
-    twin, caster, samples = lit_from_beside
+    twin, caster, samples, glints = lit_from_beside
     true = Vignetting(-0.5, -0.1)
-    decided = decide(vignetted(samples, twin, true), twin, caster, {})
+    decided = decide(vignetted(samples, twin, true), twin, caster, glints, {})
     on = dict.fromkeys(("offset", "shadows", "vignetting"), "on")
     assert states(decided) == {**dict.fromkeys(LIGHT, "off"), **on}
     np.testing.assert_allclose(sorted(decided.effects["offset"].guides_mm), GUIDES_MM, atol=0.5)
@@ -148,5 +158,5 @@ def vignetted(samples, twin, vignetting: Vignetting):
 
 
 def reordered(made):
-    twin, caster, samples = made
-    return samples, twin, caster
+    twin, caster, samples, glints = made
+    return samples, twin, caster, glints
