@@ -96,6 +96,8 @@ def test_fuse_of_a_damaged_sequence_is_a_twin_or_one_sentence(made, data):
 
 COMMANDS = {
     "align twin -o out": "out",
+    "align twin --align off -o out --against tube/pose.txt": "out",
+    "check dataset --labels": None,
     "effects twin": None,
     "eval twin --sheet out.png": "out.png",
     "eval --renders renders --sequence tube": None,
@@ -105,6 +107,8 @@ COMMANDS = {
     "inspect twin --screenshot out.png --map coverage": "out.png",
     "synth twin --trajectory jitter:frames=2 --camera tube/camera.json -o out": "out",
     "synth twin --trajectory tube/pose.txt -o out": "out",
+    "synth twin --trajectory jitter:frames=2 --effects like=tube -o out": "out",
+    "synth twin --trajectory spline:keyframes.txt,frames=2 --vary ranges.yaml -o out": "out",
 }
 """What each writes."""
 
