@@ -328,6 +328,26 @@ def test_an_empty_folder_may_be_overwritten(tmp_path):
     assert contents(tmp_path) == {"out/mark": "new"}
 
 
+def test_a_link_to_a_file_stays_a_link_and_what_it_names_is_replaced(tmp_path):
+    (tmp_path / "elsewhere").mkdir()
+    file, link = tmp_path / "elsewhere" / "file", tmp_path / "link"
+    link.symlink_to(file)
+    for text in ("1", "2"):
+        with whole_file(link, overwrite=True) as beside:
+            beside.write_text(text)
+        assert link.is_symlink() and file.read_text() == text
+    write_with_parts(link, b"3", {"p-3": b"3"}, re.compile("p-[0-9]"), overwrite=True)
+    assert link.is_symlink() and contents(tmp_path / "elsewhere") == {"file": "3", "p-3": "3"}
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Windows has no such files")
+def test_a_device_or_pipe_is_never_replaced(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    for place in (tmp_path / "pipe", Path("/dev/null")):
+        with pytest.raises(OutputError, match="is a device or pipe"):
+            check_free(place, overwrite=True)
+
+
 def test_a_folder_is_no_place_for_a_file(tmp_path):
     with pytest.raises(OutputError, match="is a folder"):
         check_free(tmp_path, overwrite=True)

@@ -70,8 +70,9 @@ def check_apart(path: Path, inputs: Iterable[Path | str | None]) -> None:
 
 def _check_own(path: Path, mark: str | None) -> None:
     if mark is None:
-        if path.is_dir():
-            raise OutputError(f"{path} is a folder; give the name of a file")
+        if not path.is_file():
+            kind = "is a folder" if path.is_dir() else "is a device or pipe"
+            raise OutputError(f"{path} {kind}; give the name of a file")
     elif not path.is_dir() or (any(path.iterdir()) and not (path / mark).is_file()):
         raise OutputError(
             f"{path} exists already and is not endotwin's to replace (it has no {mark}); choose another name"
@@ -119,12 +120,13 @@ def whole_file(path: Path, overwrite: bool = False) -> Iterator[Path]:
     """
     path = Path(path)
     check_free(path, overwrite)
-    with _told(path), _parents_made(path), _workplace(path.absolute().parent) as work:
+    target = path.resolve()
+    with _told(path), _parents_made(target), _workplace(target.parent) as work:
         beside = work / path.name
         yield beside
         _settle(beside)
-        beside.replace(path)
-        _settle(path.absolute().parent)
+        beside.replace(target)
+        _settle(target.parent)
 
 
 def write_folder(
@@ -188,10 +190,10 @@ def write_with_parts(
     Raises:
         OutputError: ``path`` exists and ``overwrite`` is false, or it cannot be written.
     """
-    path = Path(path)
     check_free(path, overwrite)
-    with _told(path), _parents_made(path):
-        _exchange(path.absolute().parent, {**parts, path.name: content}, path.name, own)
+    target = Path(path).resolve()
+    with _told(path), _parents_made(target):
+        _exchange(target.parent, {**parts, target.name: content}, target.name, own)
 
 
 def move_folder(new: Path, path: Path, own: Callable[[Path], bool]) -> None:

@@ -353,8 +353,9 @@ class Twin:
                 f"{path} is a damaged twin ({error.filename} is gone); make it again with 'endotwin fuse'"
             ) from error
         except (OSError, KeyError, TypeError, ValueError, AttributeError, SafetensorError) as error:
+            what = f"it has no {error}" if isinstance(error, KeyError) else error
             raise TwinError(
-                f"{path} is a damaged twin ({error}); make it again with 'endotwin fuse'"
+                f"{path} is a damaged twin ({what}); make it again with 'endotwin fuse'"
             ) from error
 
 
