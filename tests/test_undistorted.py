@@ -50,6 +50,7 @@ def test_frames_are_what_a_pinhole_in_their_place_would_have_seen(distorted):
 
 def test_a_twin_of_undistorted_frames_opens_them_so_again(distorted, tmp_path):
     twin = endotwin.fuse_twin(distorted, undistort=(160, 120))
+    assert (twin.camera.model, twin.camera.width, twin.camera.height) == ("pinhole", 160, 120)
     twin.save(tmp_path / "twin")
     again = endotwin.Twin.load(tmp_path / "twin")
     assert again.sequence().camera == twin.camera
@@ -61,3 +62,5 @@ def test_a_size_that_enlarges_or_a_scale_beside_it_is_refused(distorted):
         open_sequence(distorted, undistort=(640, 480))
     with pytest.raises(OptionError, match="leave the scale out"):
         open_sequence(distorted, undistort=(160, 120), scale=0.5)
+    with pytest.raises(OptionError, match="leave the scale out"):
+        endotwin.fuse_twin(distorted, undistort=(160, 120), scale=0.5)

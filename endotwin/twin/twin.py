@@ -413,8 +413,9 @@ def _read_document(path: Path) -> dict:
     except NotADirectoryError:
         raise TwinError(f"{path} is a file; give the folder of the twin") from None
     except FileNotFoundError:
+        name = "TWIN" if path.exists() else path
         raise TwinError(
-            f"{path} is not a twin (it has no twin.json); make one with 'endotwin fuse SEQUENCE -o {path}'"
+            f"{path} is not a twin (it has no twin.json); make one with 'endotwin fuse SEQUENCE -o {name}'"
         ) from None
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise TwinError(
