@@ -147,7 +147,7 @@ def test_a_twin_whose_sequence_is_gone_is_refused_in_a_sentence_that_names_both(
     shutil.rmtree(tmp_path / "lost")
     code, _, err = study("--twin", tmp_path / "twin", "-o", tmp_path / "s")
     assert code == 2 and err.count("\n") == 1
-    assert f"{tmp_path / 'twin'} needs the sequence that it was made from" in err and "lost" in err
+    assert f"{tmp_path / 'twin'} cannot be compared with the tests" in err and "lost, from which" in err
     assert [entry.name for entry in tmp_path.iterdir()] == ["twin"]
 
 
@@ -161,6 +161,14 @@ def black(folder: Path) -> None:
     """Every photo black."""
     for file in folder.glob("*_color.png"):
         cv2.imwrite(str(file), np.zeros_like(cv2.imread(str(file))))
+
+
+@pytest.mark.parametrize("role", ["--real", "--twin", "--test"])
+def test_an_input_that_is_named_twice_is_refused(made, other, study, tmp_path, role):
+    again = {"--real": made / "tube", "--twin": made / "twin", "--test": other}[role]
+    code, _, err = study(role, again, "-o", tmp_path / "s")
+    assert code == 2 and f"is named twice as {role}" in err
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize(("spoil", "told"), [(empty, "no depth within 100 mm"), (black, "only black photos")])

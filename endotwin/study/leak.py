@@ -53,6 +53,4 @@ def _source(folder: Path, twin: Twin) -> Sequence:
         twin.sequence()
         return open_sequence(Path(twin.source.path), twin.source.format)
     except SequenceError as error:
-        raise SequenceError(
-            f"{folder} needs the sequence that it was made from, with which tests are compared: {error}"
-        ) from error
+        raise SequenceError(f"{folder} cannot be compared with the tests: {error}") from error

@@ -133,6 +133,9 @@ class _Experiment:
         for what, given in (("--real", real), ("--twin", twins), ("--test", tests)):
             if not given:
                 raise OptionError(f"the study needs at least one {what}")
+            places = [Path(path).resolve() for path in given]
+            if twice := [path for path, place in zip(given, places, strict=True) if places.count(place) > 1]:
+                raise OptionError(f"{twice[0]} is named twice as {what}; name it once")
         self.plan, self.out, self.progress = plan, Path(out), progress
         self.work = self.out.absolute().with_name(self.out.name + PARTIAL)
         self.device = device_of(plan.device)

@@ -8,7 +8,8 @@ import shutil
 from collections.abc import Callable
 from pathlib import Path
 
-from endotwin.errors import OutputError
+from endotwin.errors import OptionError, OutputError
+from endotwin.pipeline import GEOMETRIES
 from endotwin.run.output import TRADEOFF, check_free, goes_on, move_folder, unwritable
 from endotwin.sequence import Sequence
 from endotwin.sequence.fingerprints import checksum, fingerprints
@@ -49,11 +50,13 @@ def tradeoff(
         one row a rung, as ``summary`` makes them; one row an effect, as ``effects.rows`` does.
 
     Raises:
-        SequenceError: no such sequence, or a frame of it cannot be read. OutputError: ``out`` is taken, or
-        ``out.partial`` is another sequence's. RungError: a command failed; what was measured before stays in
-        ``out.partial``.
+        OptionError: no such geometry. SequenceError: no such sequence, or a frame of it cannot be read.
+        OutputError: ``out`` is taken, or ``out.partial`` is another sequence's. RungError: a command failed;
+        what was measured before stays in ``out.partial``.
     """
     check_free(out, overwrite, TRADEOFF)
+    if geometry not in GEOMETRIES:
+        raise OptionError(f"geometry {geometry!r} is unknown; choose one of {', '.join(GEOMETRIES)}")
     sequence = open_sequence(path)
     sequence.require_valid_depth()
     asked = {

@@ -138,6 +138,11 @@ class Source:
 
     def open(self) -> Sequence:
         """The sequence; raises SequenceError if it has moved or changed its shape."""
+        if not Path(self.path).exists():
+            raise SequenceError(
+                f"{self.path}, from which the twin was made, is gone; put it back, or make the twin again "
+                "with 'endotwin fuse'"
+            )
         return open_sequence(Path(self.path), self.format, self.scale, self.undistort)
 
     def heldout(self, count: int) -> list[int]:
