@@ -65,6 +65,7 @@ def align(
             from endotwin.twin import Twin
         with run.stage("load"):
             twin = Twin.load(twin_folder)
+            _check_own_poses(poses, Path(twin.source.path))
             true = None if against is None else read_poses(against)[0]
         if twin.fitted and output is None and not overwrite:
             raise OutputError(
@@ -83,3 +84,12 @@ def align(
                 write_poses(poses, sequence, overwrite)
     print("\n".join(lines))
     print("wrote", " and ".join(map(str, filter(None, (output or twin_folder, poses)))))
+
+
+def _check_own_poses(poses: Path | None, sequence: Path) -> None:
+    """Raise OutputError if ``poses`` is a file of the sequence, which would then be aligned twice."""
+    folder = sequence.parent if sequence.is_file() else sequence
+    if poses is not None and poses.exists() and poses.resolve().is_relative_to(folder.resolve()):
+        raise OutputError(
+            f"{poses} belongs to the sequence {sequence}, which the twin reads again; choose another name"
+        )

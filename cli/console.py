@@ -122,6 +122,7 @@ def command(name: str, profile: Path | None = None) -> Iterator[Run]:
     finally:
         logger.removeHandler(handler)
     if profile is not None:
+        _check_profile(profile)  # again: it may be the name of what the block wrote
         with whole_file(profile, overwrite=True) as file:
             cost = {"command": name, **run.stopwatch.to_dict()}
             file.write_text(json.dumps(cost, indent=1) + "\n", encoding="utf-8")

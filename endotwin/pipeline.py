@@ -66,7 +66,7 @@ def fuse_twin(
         _check_positive("voxel size", voxel_mm)
     stopwatch = Stopwatch()
     with stopwatch.stage("open"):
-        sequence = open_sequence(path, format=format, scale=scale)
+        sequence = open_sequence(path, format=format, scale=scale, undistort=undistort)
     source = Source(
         str(Path(path).resolve()),
         sequence.format,
@@ -74,6 +74,7 @@ def fuse_twin(
         geometry,
         frames=config.frames,
         split=sequence.split,
+        undistort=undistort,
     )
     training = source.training(len(sequence))
     if not training:

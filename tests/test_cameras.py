@@ -168,6 +168,11 @@ def test_a_broken_camera_json_is_refused_by_name(tmp_path):
         read_camera(tmp_path / "camera.json")
 
 
+def test_a_camera_json_that_is_not_there_is_told_so(tmp_path):
+    with pytest.raises(CameraError, match=r"nowhere\.json cannot be read \(No such file or directory\)"):
+        read_camera(tmp_path / "nowhere.json")
+
+
 @pytest.mark.parametrize(
     ("parameters", "told"),
     [

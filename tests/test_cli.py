@@ -398,6 +398,48 @@ def test_a_profile_replaces_nothing_but_a_profile(fails, made, tmp_path, monkeyp
     assert {file: file.read_bytes() for file in tmp_path.rglob("*") if file.is_file()} == before
 
 
+def test_a_profile_does_not_replace_what_the_same_command_wrote(endotwin, made, tmp_path):
+    shutil.copytree(made / "twin", tmp_path / "twin")
+    picture = tmp_path / "sheet.png"
+    code, _, err = endotwin("eval", tmp_path / "twin", "--sheet", picture, "--profile", picture)
+    assert code == 2 and "is no profile of endotwin's" in err
+    assert cv2.imread(str(picture)) is not None
+
+
+def test_aligned_poses_do_not_replace_those_of_the_sequence(fails, made, tube):
+    before = (tube / "pose.txt").read_bytes()
+    assert invoke("fuse", tube, "-o", tube.parent / "twin") == 0
+    for name in ("pose.txt", "camera.json"):
+        command = ("align", tube.parent / "twin", "--poses", tube / name, "--overwrite")
+        assert "belongs to the sequence" in fails(*command)
+    assert (tube / "pose.txt").read_bytes() == before
+
+
+def test_undistorted_frames_are_those_that_a_twin_is_made_of(endotwin, tube, tmp_path):
+    assert endotwin("fuse", tube, "-o", tmp_path / "twin", "--undistort", "48x36")[0] == 0
+    document = json.loads((tmp_path / "twin" / "twin.json").read_text(encoding="utf-8"))
+    assert (document["camera"]["width"], document["camera"]["height"]) == (48, 36)
+
+
+def test_a_file_of_a_sequence_is_no_folder_of_one(fails, tube, tmp_path):
+    for name in ("pose.txt", "0000_color.png"):
+        assert f"{name} is a file; name the folder" in fails("fuse", tube / name, "-o", tmp_path / "twin")
+
+
+def test_a_sequence_that_is_taken_for_a_twin_is_not_proposed_as_the_place_of_one(fails, made):
+    assert "'endotwin fuse SEQUENCE -o TWIN'" in fails("fit", made / "tube")
+
+
+def test_what_ranges_are_read_from_must_be_there(fails, made, tmp_path):
+    command = ("synth", made / "twin", "--trajectory", "jitter:frames=1", "-o", tmp_path / "data")
+    assert "no.yaml cannot be read (No such file" in fails(*command, "--vary", tmp_path / "no.yaml")
+
+
+def test_an_effect_that_is_named_twice_is_refused(fails, made, tmp_path):
+    command = ("synth", made / "twin", "--trajectory", "jitter:frames=1", "-o", tmp_path / "data")
+    assert "names noise twice" in fails(*command, "--effects", "noise=on,noise=off")
+
+
 def test_a_profile_is_replaced_by_the_next(endotwin, made, tmp_path):
     shutil.copytree(made / "twin", tmp_path / "twin")
     for command in (["eval", tmp_path / "twin"], ["fuse", made / "tube", "-o", tmp_path / "new"]):

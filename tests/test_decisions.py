@@ -19,6 +19,7 @@ def fitted(folder: Path, seed: int, effects: set[str]) -> tuple[Twin, dict]:
     return endotwin.fit_twin(endotwin.fuse_twin(folder)), made
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("seed", "effects"), [(12, {"gain"}), (13, {"profile"})], ids=["gain", "profile"])
 def test_a_fit_finds_what_a_scene_has_and_nothing_else(tmp_path: Path, seed: int, effects: set[str]) -> None:
     twin, made = fitted(tmp_path, seed, effects)

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shutil
 import struct
 import subprocess
@@ -14,6 +15,7 @@ import numpy as np
 import pytest
 import trimesh
 import tube_twin
+from faults import killed_at_every_operation
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
@@ -27,8 +29,10 @@ from endotwin.effects.profile import Profile
 from endotwin.errors import OptionError, OutputError, TwinError
 from endotwin.evaluation.metrics import psnr
 from endotwin.export import FORMATS, export
-from endotwin.export.appearance import diffuse_color
+from endotwin.export.appearance import Appearance, diffuse_color
+from endotwin.export.glb import srgb
 from endotwin.export.mitsuba import matrix
+from endotwin.export.textured import textured
 from endotwin.light import film as light_film
 from endotwin.light import shading
 from endotwin.surface.vectors import unit
@@ -47,9 +51,9 @@ def twin():
 
 @pytest.fixture(scope="module")
 def files(twin, tmp_path_factory) -> Path:
-    """A folder with ``colon`` in every format of one file."""
+    """A folder with ``colon`` in the formats of a lighter mesh."""
     folder = tmp_path_factory.mktemp("exported")
-    for suffix in (".glb", ".ply", ".obj"):
+    for suffix in (".glb", ".obj"):
         export(with_effects(twin, Offset(GUIDES), Coat(0.5, 0.1)), folder / f"colon{suffix}")
     return folder
 
@@ -80,8 +84,9 @@ def with_effects(twin, *effects):
     return replace(twin, effects=Effects(effects))
 
 
-def test_a_ply_has_every_map_of_every_vertex_by_name(twin, files):
-    mesh = trimesh.load(files / "colon.ply", process=False)
+def test_a_ply_has_every_map_of_every_vertex_by_name(twin, tmp_path):
+    export(with_effects(twin, Offset(GUIDES), Coat(0.5, 0.1)), tmp_path / "colon.ply")
+    mesh = trimesh.load(tmp_path / "colon.ply", process=False)
     np.testing.assert_allclose(mesh.vertices, twin.surface.vertices_mm + twin.surface.origin_mm, atol=1e-4)
     np.testing.assert_array_equal(mesh.faces, twin.surface.triangles)
     np.testing.assert_allclose(mesh.vertex_normals, twin.surface.normals, atol=1e-6)
@@ -394,3 +399,59 @@ def test_what_cannot_be_exported_is_refused_in_a_sentence_and_leaves_nothing(twi
         twin.export(tmp_path / "mine.mitsuba", overwrite=True)
     assert sorted(os.listdir(tmp_path)) == ["colon.ply", "mine.mitsuba"]
     assert (tmp_path / "colon.ply").read_text() == "precious"
+
+
+def files_of_obj(file: Path) -> dict[str, bytes]:
+    """An OBJ, the material that it names, and the pictures that the material names."""
+    found = {file.name: file.read_bytes()}
+    for name in re.findall(r"^mtllib (.+)$", found[file.name].decode(), re.MULTILINE):
+        found[name] = file.with_name(name).read_bytes()
+        for picture in re.findall(r"^(?:map_\w+|norm) (.+)$", found[name].decode(), re.MULTILINE):
+            found[picture] = file.with_name(picture).read_bytes()
+    return found
+
+
+@pytest.mark.slow
+def test_an_obj_and_all_it_refers_to_are_old_or_new_wherever_its_export_is_killed(
+    twin, tmp_path, monkeypatch
+):
+    file, seen, mesh = tmp_path / "my twin.obj", [], textured(twin)
+    corners, few = np.unique(mesh.triangles[:100], return_inverse=True)
+    parts = {part: getattr(mesh, part)[corners] for part in ("vertices_mm", "normals", "uv")}
+    parts |= {part: getattr(mesh, part)[::8, ::8] for part in ("base_color", "roughness", "normal")}
+    looks = {"old": replace(mesh, triangles=few.reshape(-1, 3), **parts)}
+    looks["new"] = replace(looks["old"], base_color=looks["old"].base_color / 2)
+
+    look = Appearance.of(twin)
+    monkeypatch.setattr(Appearance, "of", lambda _: look)
+
+    def write(which: str) -> None:
+        monkeypatch.setattr("endotwin.export.obj.textured", lambda _: looks[which])
+        export(twin, file, overwrite=True)
+
+    whole = {}
+    for which in ("new", "old"):
+        write(which)
+        whole[which] = files_of_obj(file)
+        assert len(whole[which]) == 5 and {each.name for each in tmp_path.iterdir()} == set(whole[which])
+
+    def check() -> None:
+        seen.append(next(which for which in whole if files_of_obj(file) == whole[which]))
+        write("old")
+        assert {each.name: each.read_bytes() for each in tmp_path.iterdir()} == whole["old"]
+
+    assert killed_at_every_operation(lambda: write("new"), check) >= 20
+    assert seen == sorted(seen, reverse=True) and set(seen) == {"old", "new"}
+    np.testing.assert_array_equal(
+        np.asarray(trimesh.load(file).visual.material.image), np.rint(255 * srgb(looks["old"].base_color))
+    )
+
+
+def test_a_mitsuba_scene_is_replaced_with_its_guests_kept(twin, tmp_path):
+    folder = tmp_path / "colon.mitsuba"
+    export(twin, folder)
+    names = sorted(os.listdir(folder))
+    (folder / "notes.txt").write_text("mine")
+    export(with_effects(twin, Coat(0.5, 0.1)), folder, overwrite=True)
+    assert sorted(os.listdir(folder)) == sorted([*names, "notes.txt"])
+    assert os.listdir(tmp_path) == ["colon.mitsuba"]

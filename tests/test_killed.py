@@ -23,6 +23,8 @@ OVER = {
     "align in place": ("twin", "align twin --overwrite"),
     "synth over a dataset": ("dataset", "synth twin --trajectory jitter:frames=2 -o dataset --overwrite"),
     "export over a file": ("old.glb", "export twin old.glb --overwrite"),
+    "export over several": ("old.obj", "export twin old.obj --overwrite"),
+    "export over a folder": ("old.mitsuba", "export twin old.mitsuba --overwrite"),
     "export of a package": ("new.usdz", "export twin new.usdz"),
     "export of a page": ("new.html", "export twin new.html"),
 }
@@ -42,6 +44,8 @@ def begun(made, tmp_path_factory) -> Path:
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
         assert invoke("synth", "twin", "--trajectory", "jitter:frames=3", "-o", "dataset") == 0
+        for name in ("old.obj", "old.mitsuba"):
+            assert invoke("export", "twin", name) == 0
     (folder / "old.glb").write_bytes(b"old")
     return folder
 

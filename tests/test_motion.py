@@ -159,6 +159,7 @@ def test_optical_flow_of_the_pictures_follows_the_label_better_than_a_constant_v
     assert np.median(np.concatenate(by_dis)) < 0.7 * np.median(np.concatenate(by_guess))
 
 
+@pytest.mark.slow
 def test_form_factors_at_rest_err_hardly_more_than_two_countings_of_the_moved_ones(plain):
     """Bounced light on the moved surface, with the form factors at rest and with its own, counted twice."""
     effects = Effects([Specular(), Interreflection(cell_mm=2.0)])
@@ -193,6 +194,7 @@ def test_the_camera_rides_on_the_swaying_lumen_and_keeps_its_clearance(plain):
     np.testing.assert_allclose(carried.checks["clearance_mm"], tube_twin.RADIUS_MM, atol=0.3)
 
 
+@pytest.mark.slow
 def test_the_same_motion_gives_the_same_bytes_in_any_number_of_processes_and_after_a_stop(twin, tmp_path):
     job = job_of(twin, [WAVES], "rgb,depth,flow_npz,scene_flow,vertices")
     job = replace(job, shard_frames=1)

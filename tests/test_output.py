@@ -11,7 +11,16 @@ import pytest
 from faults import full_disk, killed_at_every_operation
 
 from endotwin.errors import OutputError
-from endotwin.run.output import check_apart, check_free, check_picture, move_folder, whole_file, write_folder
+from endotwin.run.output import (
+    check_apart,
+    check_free,
+    check_picture,
+    move_folder,
+    whole_file,
+    write_folder,
+    write_folder_anew,
+    write_with_parts,
+)
 
 OWN = re.compile("mark|[a-z]-[0-9]")
 
@@ -141,6 +150,66 @@ def test_a_file_is_old_or_new_wherever_its_replacement_is_killed(tmp_path):
     assert killed_at_every_operation(work, look) >= 5
 
 
+def test_a_file_and_its_parts_are_old_or_new_wherever_their_replacement_is_killed(tmp_path):
+    file = tmp_path / "file"
+    (tmp_path / "p-9").write_text("another's")
+    parts = {"old": {"p-1": "1", "q-1": "1"}, "new": {"p-2": "2", "q-1": "1", "r-1": "1"}}
+    seen = []
+
+    def write_all(text: str) -> None:
+        named = {name: part.encode() for name, part in parts[text].items()}
+        write_with_parts(file, text.encode(), named, re.compile("[pqr]-[1-8]"), overwrite=True)
+
+    def look() -> None:
+        there = contents(tmp_path)
+        seen.append(there["file"])
+        assert {**there, **parts[there["file"]]} == there
+        write_all("old")
+        assert contents(tmp_path) == {"file": "old", "p-9": "another's", **parts["old"]}
+
+    write_all("old")
+    assert killed_at_every_operation(lambda: write_all("new"), look) >= 15
+    assert seen == sorted(seen, reverse=True) and set(seen) == {"old", "new"}
+    assert {entry.name for entry in tmp_path.iterdir()} == {"file", "p-9", *parts["old"]}
+
+
+def test_what_is_killed_in_a_folder_is_swept_by_whatever_is_written_there_next(made):
+    def look() -> None:
+        with whole_file(made / "other", overwrite=True) as file:
+            file.write_text("2")
+        assert not [entry for entry in made.iterdir() if entry.name.startswith(".")]
+        write(made, overwrite=True, mark="old", a_1="old")
+
+    killed_at_every_operation(lambda: write(made, overwrite=True, mark="new", a_2="new"), look)
+
+
+@pytest.mark.parametrize("begins", [{}, {"mark": "old", "a-1": "old", "c-1": "old", "notes": "mine"}])
+def test_a_folder_whose_names_change_their_content_is_old_or_new_wherever_it_is_killed(tmp_path, begins):
+    out, new = tmp_path / "out", {"mark": "new", "a-1": "new"}
+    mine = {name: text for name, text in begins.items() if name == "notes"}
+
+    def begin() -> None:
+        shutil.rmtree(out, ignore_errors=True)
+        if begins:
+            out.mkdir()
+            write_texts(out, **begins)
+
+    def work() -> None:
+        named = {name: text.encode() for name, text in new.items()}
+        write_folder_anew(out, named, "mark", OWN, overwrite=True)
+
+    def look() -> None:
+        there = {name: text for name, text in contents(out).items() if not name.startswith(".endotwin-")}
+        assert there in (begins, {**new, **mine})
+        work()
+        assert contents(tmp_path) == {f"out/{name}": text for name, text in {**new, **mine}.items()}
+        assert list(tmp_path.iterdir()) == [out]
+        begin()
+
+    begin()
+    assert killed_at_every_operation(work, look) >= 10
+
+
 def test_what_a_living_run_is_writing_is_not_swept(tmp_path):
     with whole_file(tmp_path / "one") as first:
         first.write_text("1")
@@ -257,6 +326,26 @@ def test_an_empty_folder_may_be_overwritten(tmp_path):
     (tmp_path / "out").mkdir()
     write(tmp_path / "out", overwrite=True, mark="new")
     assert contents(tmp_path) == {"out/mark": "new"}
+
+
+def test_a_link_to_a_file_stays_a_link_and_what_it_names_is_replaced(tmp_path):
+    (tmp_path / "elsewhere").mkdir()
+    file, link = tmp_path / "elsewhere" / "file", tmp_path / "link"
+    link.symlink_to(file)
+    for text in ("1", "2"):
+        with whole_file(link, overwrite=True) as beside:
+            beside.write_text(text)
+        assert link.is_symlink() and file.read_text() == text
+    write_with_parts(link, b"3", {"p-3": b"3"}, re.compile("p-[0-9]"), overwrite=True)
+    assert link.is_symlink() and contents(tmp_path / "elsewhere") == {"file": "3", "p-3": "3"}
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Windows has no such files")
+def test_a_device_or_pipe_is_never_replaced(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    for place in (tmp_path / "pipe", Path("/dev/null")):
+        with pytest.raises(OutputError, match="is a device or pipe"):
+            check_free(place, overwrite=True)
 
 
 def test_a_folder_is_no_place_for_a_file(tmp_path):

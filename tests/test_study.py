@@ -8,14 +8,16 @@ import shutil
 import signal
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
+import tifffile
 import tube_sequence
 from command_line import invoke
 from endotwin.cli import console
 
 import endotwin
-from endotwin.errors import OptionError, TwinError
+from endotwin.errors import OptionError, OutputError, TwinError
 from endotwin.sequence.readers import open_sequence
 from endotwin.study import parse_parts, study_depth
 from endotwin.study.accuracy import METRICS
@@ -117,13 +119,11 @@ def test_one_photo_or_one_depth_map_in_common_is_a_leak(made, other, tmp_path):
                 blacken(file)
         with pytest.raises(LeakError, match="knows 1 of its photos"):
             require_unseen([open_sequence(mixed)], [], twins)
-    assert "none of the photos" in require_unseen([open_sequence(other)], [], twins)
+    assert "none of the photos" in require_unseen([open_sequence(other)], [], twins)[0]
 
 
 def blacken(file: Path) -> None:
     """Change the pixels of a photo or depth map."""
-    import cv2
-
     image = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
     image[: len(image) // 2] = image[0, 0] // 2
     cv2.imwrite(str(file), image)
@@ -134,15 +134,74 @@ def test_a_test_that_is_trained_on_is_refused(made, other):
         require_unseen([open_sequence(other)], [open_sequence(other)], {})
 
 
-def test_a_twin_whose_sequence_is_gone_is_judged_by_its_name(made, other, tmp_path, caplog):
+def test_a_copy_is_a_leak_though_the_twin_was_made_at_another_scale(made, tmp_path):
+    shutil.copytree(made / "tube", tmp_path / "renamed")
+    small = endotwin.fuse_twin(made / "tube", scale=0.5)
+    with pytest.raises(LeakError, match="knows 8 of its photos"):
+        require_unseen([open_sequence(tmp_path / "renamed")], [], {Path("twin"): small})
+
+
+def test_a_twin_whose_sequence_is_gone_is_refused_in_a_sentence_that_names_both(made, study, tmp_path):
     shutil.copytree(made / "tube", tmp_path / "lost")
-    twin = endotwin.fuse_twin(tmp_path / "lost")
+    endotwin.fit_twin(endotwin.fuse_twin(tmp_path / "lost")).save(tmp_path / "twin")
     shutil.rmtree(tmp_path / "lost")
-    require_unseen([open_sequence(other)], [], {Path("twin"): twin})
-    assert "by name alone" in caplog.text
-    elsewhere = tube_sequence.write(tmp_path / "elsewhere" / "lost", 2, 40, 30)
-    with pytest.raises(LeakError, match="of this name"):
-        require_unseen([open_sequence(elsewhere)], [], {Path("twin"): twin})
+    code, _, err = study("--twin", tmp_path / "twin", "-o", tmp_path / "s")
+    assert code == 2 and err.count("\n") == 1
+    assert f"{tmp_path / 'twin'} cannot be compared with the tests" in err and "lost, from which" in err
+    assert [entry.name for entry in tmp_path.iterdir()] == ["twin"]
+
+
+def empty(folder: Path) -> None:
+    """No depth in any frame."""
+    for file in folder.glob("*_depth.tiff"):
+        tifffile.imwrite(file, np.zeros_like(tifffile.imread(file)))
+
+
+def black(folder: Path) -> None:
+    """Every photo black."""
+    for file in folder.glob("*_color.png"):
+        cv2.imwrite(str(file), np.zeros_like(cv2.imread(str(file))))
+
+
+@pytest.mark.parametrize("role", ["--real", "--twin", "--test"])
+def test_an_input_that_is_named_twice_is_refused(made, other, study, tmp_path, role):
+    again = {"--real": made / "tube", "--twin": made / "twin", "--test": other}[role]
+    code, _, err = study(role, again, "-o", tmp_path / "s")
+    assert code == 2 and f"is named twice as {role}" in err
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(("spoil", "told"), [(empty, "no depth within 100 mm"), (black, "only black photos")])
+@pytest.mark.parametrize("role", ["--real", "--test"])
+def test_what_cannot_be_learned_from_or_judged_by_is_refused_before_any_training(
+    made, study, tmp_path, role, spoil, told
+):
+    spoil(tube_sequence.write(tmp_path / "spoilt", 3, 44, 33))
+    code, _, err = study(role, tmp_path / "spoilt", "-o", tmp_path / "s")
+    assert code == 2 and err.startswith("error: ") and err.count("\n") == 1, err
+    assert "spoilt" in err and told in err
+    assert [entry.name for entry in tmp_path.iterdir()] == ["spoilt"]
+
+
+def test_a_study_does_not_go_on_from_frames_that_were_changed(made, other, tmp_path, monkeypatch):
+    def stop(*_):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr("endotwin.study.run.train", stop)
+        with pytest.raises(KeyboardInterrupt):
+            study_depth([made / "tube"], [made / "twin"], [other], tmp_path / "s", Plan(network="small"))
+    changed = tmp_path / "changed"
+    shutil.copytree(other, changed)
+    blacken(changed / "0001_depth.tiff")
+    other.rename(tmp_path / "kept")
+    changed.rename(other)
+    try:
+        with pytest.raises(OutputError, match="of other frames; delete it"):
+            study_depth([made / "tube"], [made / "twin"], [other], tmp_path / "s", Plan(network="small"))
+    finally:
+        shutil.rmtree(other)
+        (tmp_path / "kept").rename(other)
 
 
 @pytest.mark.parametrize(

@@ -271,6 +271,7 @@ def test_the_results_tell_the_scores_that_eval_gave(made):
         (["--budget", "soon", "--rungs", "endopbr"], "soon"),
         (["--effects", "method=endopbr"], "fits no effects"),
         (["--effects", "gloss=2"], "no knob"),
+        (["--geometry", "all", "--rungs", "draft"], "known, heldout"),
     ],
 )
 def test_a_mistake_is_one_line_and_leaves_nothing(made, tmp_path, monkeypatch, capsys, options, told):

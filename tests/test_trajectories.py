@@ -158,6 +158,15 @@ def test_poses_of_a_file_are_taken_as_they_are(tube, tmp_path):
     np.testing.assert_allclose(trajectory.T_world_camera, poses, rtol=0, atol=1e-14)
 
 
+@pytest.mark.parametrize(("unit", "warns"), [(1.0, False), (1e-3, True), (0.0, False)])
+def test_a_path_in_metres_gives_a_warning_and_one_that_only_turns_none(tube, tmp_path, caplog, unit, warns):
+    poses = np.stack([tube_twin.pose(s) for s in (0.4, 0.6)])
+    poses[:, :3, 3] = poses[0, :3, 3] * (1 - unit) + poses[:, :3, 3] * unit
+    write_c3vd_poses(tmp_path / "path.txt", poses)
+    parse_trajectory(str(tmp_path / "path.txt"), tube, seed=0)
+    assert ("if they are in metres" in caplog.text) == warns
+
+
 @pytest.mark.parametrize(
     ("move", "fault"),
     [
@@ -190,7 +199,7 @@ def test_a_pose_outside_the_lumen_is_refused_by_its_number_and_file(tube, tmp_pa
         ("jitter:frames", "translation"),
         ("jitter:frames=2,frames=3", "translation"),
         ("centerline:speed=inf", "mm a frame"),
-        ("centerline:reverse=perhaps", "reverse"),
+        ("centerline:reverse=perhaps", "is true or false"),
         ("centerline:translation=2", "reverse"),
     ],
 )

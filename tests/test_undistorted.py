@@ -20,9 +20,9 @@ def distorted(tmp_path_factory):
     """A tube seen through a fisheye: each pixel the tube's own photograph along that pixel's ray."""
     folder = tube_sequence.write(tmp_path_factory.mktemp("undistorted") / "tube", 3, 320, 240)
     camera = Fisheye(**{key: value for key, value in FISHEYE.items() if key != "model"}, k1=0.02)
-    wide = {"model": "pinhole", "width": 2000, "height": 1600, "fx": 500, "fy": 500, "cx": 999.5, "cy": 799.5}
-    u, v = (500 * camera.pixel_directions[..., k] / camera.pixel_directions[..., 2] for k in (0, 1))
-    at = (u + 999.5).astype(np.float32), (v + 799.5).astype(np.float32)
+    wide = {"model": "pinhole", "width": 1000, "height": 800, "fx": 250, "fy": 250, "cx": 499.5, "cy": 399.5}
+    u, v = (250 * camera.pixel_directions[..., k] / camera.pixel_directions[..., 2] for k in (0, 1))
+    at = (u + 499.5).astype(np.float32), (v + 399.5).astype(np.float32)
     for index, pose in enumerate(tube_sequence.poses(3)):
         photo, depth_mm = tube_sequence.photograph(wide, pose)
         cv2.imwrite(
@@ -50,6 +50,7 @@ def test_frames_are_what_a_pinhole_in_their_place_would_have_seen(distorted):
 
 def test_a_twin_of_undistorted_frames_opens_them_so_again(distorted, tmp_path):
     twin = endotwin.fuse_twin(distorted, undistort=(160, 120))
+    assert (twin.camera.model, twin.camera.width, twin.camera.height) == ("pinhole", 160, 120)
     twin.save(tmp_path / "twin")
     again = endotwin.Twin.load(tmp_path / "twin")
     assert again.sequence().camera == twin.camera
@@ -61,3 +62,5 @@ def test_a_size_that_enlarges_or_a_scale_beside_it_is_refused(distorted):
         open_sequence(distorted, undistort=(640, 480))
     with pytest.raises(OptionError, match="leave the scale out"):
         open_sequence(distorted, undistort=(160, 120), scale=0.5)
+    with pytest.raises(OptionError, match="leave the scale out"):
+        endotwin.fuse_twin(distorted, undistort=(160, 120), scale=0.5)

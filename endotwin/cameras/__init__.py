@@ -101,7 +101,9 @@ def read_camera(path: Path) -> Camera:
     """The camera in a ``camera.json``; raises CameraError where it is no camera."""
     try:
         description = parsed(Path(path).read_text(encoding="utf-8-sig"))
-    except (OSError, ValueError) as error:
+    except OSError as error:
+        raise CameraError(f"{path} cannot be read ({error.strerror}); check its name") from error
+    except ValueError as error:
         raise CameraError(
             f"{path} cannot be read as JSON ({error}); write it as {_example(Pinhole)}"
         ) from error

@@ -97,11 +97,13 @@ def parse_states(text: str, like: bool = False) -> dict[str, str]:
     """``shadows=off,gain=on`` as states by name; with ``like``, ``like=SEQUENCE`` too.
 
     Raises:
-        OptionError: an unknown effect or state.
+        OptionError: an unknown effect or state, or one that is named twice.
     """
     states = {}
     for entry in filter(None, (part.strip() for part in text.split(","))):
         name, _, state = entry.partition("=")
+        if name in states:
+            raise OptionError(f"'{text}' names {name} twice; say once how it shall be")
         if like and name == "like" and state:
             states[name] = state
             continue

@@ -22,7 +22,7 @@ from endotwin.light.film import Film
 from endotwin.light.guides import AT_LENS, log_axis
 from endotwin.light.incidence import COS_MIN
 from endotwin.light.shading import ROUGHNESS_MIN
-from endotwin.run.output import write_folder
+from endotwin.run.output import write_folder_anew
 from endotwin.surface import Surface
 from endotwin.surface.vectors import dot, unit
 from endotwin.synth.trajectories.recorded import path_or_flight
@@ -60,7 +60,7 @@ def write_mitsuba(twin: Twin, path: Path, overwrite: bool = False) -> None:
         "endotwin.json": (json.dumps(look.to_dict(), indent=1) + "\n").encode(),
         SCENE: _scene(twin, look, lobes, poses[0] if len(poses) else np.eye(4), field),
     }
-    write_folder(path, files, SCENE, OWN, overwrite)
+    write_folder_anew(path, files, SCENE, OWN, overwrite)
 
 
 def matrix(pose: np.ndarray) -> str:

@@ -1,12 +1,13 @@
 """Wavefront OBJ with its material and textures, in the world's mm (OpenCV's axes, as the poses are).
 
-The pictures and the material are named after the mesh, which is written last.
+The mesh is the last to get its name: before, nothing refers to the material and the pictures.
 """
 
 from __future__ import annotations
 
+import hashlib
 import io
-from contextlib import ExitStack
+import re
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,7 @@ import numpy as np
 from endotwin.export.appearance import Appearance
 from endotwin.export.glb import png, srgb
 from endotwin.export.textured import Textured, textured
-from endotwin.run.output import check_free, whole_file
+from endotwin.run.output import write_with_parts
 from endotwin.twin import Twin
 
 MATERIAL = """# endotwin: light L0 {L0:.6g}, n {n:.6g}, q {q:.6g}; display = x^{gamma:.6g}; f0 {f0:.6g}
@@ -34,25 +35,21 @@ norm {stem}_normal.png
 
 
 def write_obj(twin: Twin, path: Path, overwrite: bool = False) -> None:
-    """Write ``twin`` as ``path`` and, beside it, its ``.mtl`` and three pictures."""
+    """Write ``twin`` as ``path`` and, beside it, its ``.mtl`` and three pictures, named by their checksum."""
     path = Path(path)
-    names = {
-        part: path.with_name(f"{path.stem}_{part}.png") for part in ("base_color", "roughness", "normal")
-    }
-    for each in (path, path.with_suffix(".mtl"), *names.values()):
-        check_free(each, overwrite)
     mesh, look = textured(twin), Appearance.of(twin)
     pictures = {
-        "base_color": srgb(mesh.base_color),
-        "roughness": mesh.roughness,
-        "normal": mesh.normal / 2 + 0.5,
+        "base_color": png(srgb(mesh.base_color)),
+        "roughness": png(mesh.roughness),
+        "normal": png(mesh.normal / 2 + 0.5),
     }
-    contents = {names[part]: png(picture) for part, picture in pictures.items()}
-    contents[path.with_suffix(".mtl")] = MATERIAL.format(stem=path.stem, **look.to_dict()).encode()
-    contents[path] = _mesh(mesh, twin.surface.origin_mm, path.stem)
-    with ExitStack() as opened:  # every file is written before the first one is moved to its place
-        for file, content in reversed(contents.items()):
-            opened.enter_context(whole_file(file, overwrite)).write_bytes(content)
+    material = MATERIAL.format(stem="{stem}", **look.to_dict())
+    checksum = hashlib.sha256(b"".join([material.encode(), *pictures.values()])).hexdigest()[:16]
+    stem = f"{path.stem}-{checksum}"
+    parts = {f"{stem}_{part}.png": picture for part, picture in pictures.items()}
+    parts[f"{stem}.mtl"] = material.format(stem=stem).encode()
+    own = re.compile(rf"{re.escape(path.stem)}-[0-9a-f]{{16}}(\.mtl|_({'|'.join(pictures)})\.png)")
+    write_with_parts(path, _mesh(mesh, twin.surface.origin_mm, stem), parts, own, overwrite)
 
 
 def _mesh(mesh: Textured, origin_mm: np.ndarray, stem: str) -> bytes:

@@ -70,8 +70,9 @@ def check_apart(path: Path, inputs: Iterable[Path | str | None]) -> None:
 
 def _check_own(path: Path, mark: str | None) -> None:
     if mark is None:
-        if path.is_dir():
-            raise OutputError(f"{path} is a folder; give the name of a file")
+        if not path.is_file():
+            kind = "is a folder" if path.is_dir() else "is a device or pipe"
+            raise OutputError(f"{path} {kind}; give the name of a file")
     elif not path.is_dir() or (any(path.iterdir()) and not (path / mark).is_file()):
         raise OutputError(
             f"{path} exists already and is not endotwin's to replace (it has no {mark}); choose another name"
@@ -119,12 +120,13 @@ def whole_file(path: Path, overwrite: bool = False) -> Iterator[Path]:
     """
     path = Path(path)
     check_free(path, overwrite)
-    with _told(path), _parents_made(path), _workplace(path.absolute().parent) as work:
+    target = path.resolve()
+    with _told(path), _parents_made(target), _workplace(target.parent) as work:
         beside = work / path.name
         yield beside
         _settle(beside)
-        beside.replace(path)
-        _settle(path.absolute().parent)
+        beside.replace(target)
+        _settle(target.parent)
 
 
 def write_folder(
@@ -152,11 +154,46 @@ def write_folder(
         with _parents_made(target), _workplace(target.parent) as work:
             new = work / target.name
             new.mkdir()
-            for name, content in files.items():
-                _write(new / name, content)
+            _write_all(new, files)
             _settle(new)
             new.rename(target)
             _settle(target.parent)
+
+
+def write_folder_anew(
+    path: Path, files: Mapping[str, bytes], mark: str, own: re.Pattern, overwrite: bool = False
+) -> None:
+    """``write_folder`` of files whose names say nothing of their content: a new folder takes the place of the
+    one that is there (``move_folder``)."""
+    check_free(path, overwrite, mark)
+    target = Path(path).resolve()
+    with _told(path), _parents_made(target), _workplace(target.parent) as work:
+        new = work / target.name
+        new.mkdir()
+        _write_all(new, files)
+        _settle(new)
+        move_folder(new, target, lambda name: bool(own.fullmatch(str(name))))
+        _settle(target.parent)
+
+
+def write_with_parts(
+    path: Path, content: bytes, parts: Mapping[str, bytes], own: re.Pattern, overwrite: bool = False
+) -> None:
+    """Write the file ``path`` and, beside it, the files that it refers to, by name.
+
+    At every instant ``path`` and what it refers to are the old or the new: its rename decides. So the name of
+    a part must stand for one content only.
+
+    Args:
+        own: names that no other file refers to; those that ``parts`` lacks are removed.
+
+    Raises:
+        OutputError: ``path`` exists and ``overwrite`` is false, or it cannot be written.
+    """
+    check_free(path, overwrite)
+    target = Path(path).resolve()
+    with _told(path), _parents_made(target):
+        _exchange(target.parent, {**parts, target.name: content}, target.name, own)
 
 
 def move_folder(new: Path, path: Path, own: Callable[[Path], bool]) -> None:
@@ -239,22 +276,21 @@ def _adopt(old: Path, new: Path, own: Callable[[Path], bool]) -> None:
 
 
 def _exchange(folder: Path, files: Mapping[str, bytes], mark: str, own: re.Pattern) -> None:
-    """``write_folder`` into a folder that is there."""
-    with _locked(folder):
+    """Write ``files`` into a folder that is there; the rename of ``mark`` decides."""
+    with _workplace(folder) as work, _locked(folder):
         kept = set(os.listdir(folder))
         fresh = [name for name in files if name != mark and not _holds(folder / name, files[name])]
         try:
-            for name in [*fresh, mark]:
-                _write(folder / f"{HIDDEN}{name}", files[name])
+            _write_all(work, {name: files[name] for name in [*fresh, mark]})
             for name in fresh:
-                (folder / f"{HIDDEN}{name}").replace(folder / name)
+                (work / name).replace(folder / name)
             _settle(folder)
-            (folder / f"{HIDDEN}{mark}").replace(folder / mark)
+            (work / mark).replace(folder / mark)
             kept = set(files)
             _settle(folder)
         finally:
             for name in set(os.listdir(folder)) - kept:
-                if own.fullmatch(name.removeprefix(HIDDEN)):
+                if own.fullmatch(name):
                     (folder / name).unlink()
 
 
@@ -262,12 +298,13 @@ def _holds(file: Path, content: bytes) -> bool:
     return file.is_file() and file.read_bytes() == content
 
 
-def _write(file: Path, content: bytes) -> None:
-    """Write a file through to the disk."""
-    with file.open("wb") as opened:
-        opened.write(content)
-        opened.flush()
-        os.fsync(opened.fileno())
+def _write_all(folder: Path, files: Mapping[str, bytes]) -> None:
+    """Write files by name, through to the disk."""
+    for name, content in files.items():
+        with (folder / name).open("wb") as opened:
+            opened.write(content)
+            opened.flush()
+            os.fsync(opened.fileno())
 
 
 def _settle(place: Path) -> None:

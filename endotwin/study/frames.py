@@ -69,6 +69,14 @@ def of_sequence(sequence: Sequence, size: Size) -> Iterator[Frame]:
     return ahead(read, range(len(sequence)), THREADS)
 
 
+def require_depth(sequence: Sequence, size: Size) -> None:
+    """Raise OptionError unless some frame at ``size`` has depth to learn from or be judged by."""
+    if not any((depth_mm <= FARTHEST_MM).any() for _, depth_mm in of_sequence(sequence, size)):
+        raise OptionError(
+            f"{sequence.path} has no depth within {FARTHEST_MM:g} mm where its photos are lit; leave it out"
+        )
+
+
 def lit_pixels(sequence: Sequence, size: Size) -> np.ndarray:
     """Bool [H, W] at ``size``: not the black around the lens circle of a sequence's photos."""
     lit = sequence.lens_mask.astype(np.float32)
@@ -119,7 +127,7 @@ def kept(frames: Iterator[Frame], count: int, size: Size, folder: Path, asked: d
                 depths.write(depth_mm.astype(np.float16).tobytes())
         (folder / ASKED).write_text(json.dumps(asked), encoding="utf-8")
     color, depth_mm = (np.load(folder / name, mmap_mode="r") for name in (COLOR, DEPTH))
-    if not (depth_mm > 0).any():
+    if not (depth_mm <= FARTHEST_MM).any():
         raise OptionError(f"{asked['source']} has no depth within {FARTHEST_MM:g} mm; leave it out")
     return Frames(color, depth_mm, np.arange(count))
 

@@ -2,81 +2,55 @@
 
 from __future__ import annotations
 
-import hashlib
-import logging
 from pathlib import Path
 
-import numpy as np
-
 from endotwin.errors import EndotwinError, SequenceError
-from endotwin.run.ahead import ahead
-from endotwin.run.threads import THREADS
 from endotwin.sequence import Sequence
+from endotwin.sequence.fingerprints import checksum, fingerprints
+from endotwin.sequence.readers import open_sequence
 from endotwin.twin import Twin
-
-logger = logging.getLogger("endotwin")
 
 
 class LeakError(EndotwinError):
     """A test sequence is known to what it shall judge."""
 
 
-def require_unseen(tests: list[Sequence], real: list[Sequence], twins: dict[Path, Twin]) -> str:
+def require_unseen(
+    tests: list[Sequence], real: list[Sequence], twins: dict[Path, Twin]
+) -> tuple[str, list[str]]:
     """Raise LeakError where a photo or a depth map of a test was fused, fitted or is trained on.
 
     Compared are the folders, and the pixels of every photo and depth map, so that a copy under another name
-    is found too. A twin whose sequence is gone is judged by the folder's name alone, with a warning.
+    is found too. A twin whose sequence is gone raises SequenceError, as does a frame that cannot be read.
 
     Returns:
-        what was compared, in words.
+        what was compared, in words; a checksum of each test, then of each of ``real``.
     """
-    known = {str(sequence.path): sequence for sequence in real}
-    makers = {name: f"--real {name}" for name in known}
-    lost = []
-    for folder, twin in twins.items():
-        source = Path(twin.source.path)
-        makers[str(source)] = f"the twin {folder}"
-        try:
-            known[str(source)] = twin.source.open()
-        except SequenceError:
-            lost.append(source)
-            logger.warning(
-                "%s, from which %s was made, is gone: whether a test is a copy of it is judged by name alone",
-                *(source, folder),
-            )
-    seen = {name: fingerprints(sequence) for name, sequence in known.items()}
+    known = {f"--real {sequence.path}": sequence for sequence in real}
+    known |= {f"the twin {folder}": _source(folder, twin) for folder, twin in twins.items()}
+    seen = {maker: fingerprints(sequence) for maker, sequence in known.items()}
+    sums = []
     for test in tests:
         own = fingerprints(test)
-        for name, prints in seen.items():
-            same = Path(name).resolve() == test.path.resolve()
-            if same or own & prints:
+        sums.append(checksum(test, own))
+        for maker, prints in seen.items():
+            common = len(set(own) & set(prints))
+            if common or known[maker].path.resolve() == test.path.resolve():
                 raise LeakError(
-                    f"{test.path} cannot be a test: {makers[name]} knows {len(own & prints)} of its photos "
-                    "and depth maps; test on another sequence"
+                    f"{test.path} cannot be a test: {maker} knows {common} of its photos and depth maps; "
+                    "test on another sequence"
                 )
-        for source in lost:
-            if source.name == test.path.name:
-                raise LeakError(
-                    f"{test.path} cannot be a test: {makers[str(source)]} was made from a sequence of this "
-                    "name; test on another sequence"
-                )
-    compared = sum(map(len, seen.values()))
+    sums += [checksum(sequence, seen[f"--real {sequence.path}"]) for sequence in real]
     return (
-        f"none of the photos and depth maps of {len(tests)} test sequences is among the {compared:,} that "
-        "the twins were made from or the networks were trained on"
-    )
+        f"none of the photos and depth maps of {len(tests)} test sequences is among the "
+        f"{len(set().union(*seen.values())):,} that the twins were made from or the networks were trained on"
+    ), sums
 
 
-def fingerprints(sequence: Sequence) -> set[str]:
-    """SHA-256 of the pixels of every photo and of every depth map that is not empty."""
-
-    def read(index: int) -> list[str]:
-        depth_mm = sequence.depth_mm(index)
-        found = [_digest(sequence.color(index))]
-        return [*found, _digest(depth_mm)] if np.isfinite(depth_mm).any() else found
-
-    return {print_ for prints in ahead(read, range(len(sequence)), THREADS) for print_ in prints}
-
-
-def _digest(image: np.ndarray) -> str:
-    return hashlib.sha256(repr(image.shape).encode() + np.ascontiguousarray(image).tobytes()).hexdigest()
+def _source(folder: Path, twin: Twin) -> Sequence:
+    """The sequence of a twin that can be rendered from, with its frames as they are on disk."""
+    try:
+        twin.sequence()
+        return open_sequence(Path(twin.source.path), twin.source.format)
+    except SequenceError as error:
+        raise SequenceError(f"{folder} cannot be compared with the tests: {error}") from error

@@ -33,7 +33,7 @@ from endotwin.sequence import Sequence
 from endotwin.sequence.readers import open_sequence
 from endotwin.study import judge, report
 from endotwin.study.arms import HEADLINE, Arm, arms
-from endotwin.study.frames import Frames, kept, lit_pixels, of_dataset, of_sequence
+from endotwin.study.frames import Frames, kept, lit_pixels, of_dataset, of_sequence, require_depth
 from endotwin.study.leak import require_unseen
 from endotwin.study.networks import found, network
 from endotwin.study.recipe import ROTATION_DEG, TRANSLATION_MM, Recipe
@@ -133,15 +133,20 @@ class _Experiment:
         for what, given in (("--real", real), ("--twin", twins), ("--test", tests)):
             if not given:
                 raise OptionError(f"the study needs at least one {what}")
+            places = [Path(path).resolve() for path in given]
+            if twice := [path for path, place in zip(given, places, strict=True) if places.count(place) > 1]:
+                raise OptionError(f"{twice[0]} is named twice as {what}; name it once")
         self.plan, self.out, self.progress = plan, Path(out), progress
         self.work = self.out.absolute().with_name(self.out.name + PARTIAL)
         self.device = device_of(plan.device)
         self.twins = {Path(folder): _fitted(folder) for folder in twins}
         self.real, self.tests = ([open_sequence(path) for path in each] for each in (real, tests))
-        self.unseen = require_unseen(self.tests, self.real, self.twins)
+        self.unseen, self.sums = require_unseen(self.tests, self.real, self.twins)
         self.network = found(plan.network)
         sample = network(self.network, 0)
         self.size, self.batch, self.rate = sample.size, sample.batch, sample.rate
+        for sequence in (*self.real, *self.tests):
+            require_depth(sequence, self.size)
         self.steps = (
             plan.steps or getattr(sample, "steps", None) or sample.epochs * plan.frames // sample.batch
         )
@@ -176,13 +181,18 @@ class _Experiment:
             "real": [str(sequence.path.resolve()) for sequence in self.real],
             "twins": {str(folder.resolve()): twin.seal for folder, twin in self.twins.items()},
             "tests": [str(sequence.path.resolve()) for sequence in self.tests],
+            "checksums": self.sums,
             "network": self.network,
             "frames": self.plan.frames,
             "steps": self.steps,
             "loss": self.plan.loss,
         }
         done = self.out / STUDY
-        if not goes_on(self.work, STUDY, asked, "another study") and done.exists() and _read(done) == asked:
+        if (
+            not goes_on(self.work, STUDY, asked, "another study, or of other frames")
+            and done.exists()
+            and _read(done) == asked
+        ):
             shutil.copytree(self.out, self.work)  # more parts are wanted
         for folder in ("results", "networks", "recipes", "datasets", "frames"):
             (self.work / folder).mkdir(parents=True, exist_ok=True)

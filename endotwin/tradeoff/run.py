@@ -8,9 +8,11 @@ import shutil
 from collections.abc import Callable
 from pathlib import Path
 
-from endotwin.errors import OutputError
+from endotwin.errors import OptionError, OutputError
+from endotwin.pipeline import GEOMETRIES
 from endotwin.run.output import TRADEOFF, check_free, goes_on, move_folder, unwritable
 from endotwin.sequence import Sequence
+from endotwin.sequence.fingerprints import checksum, fingerprints
 from endotwin.sequence.readers import open_sequence
 from endotwin.tradeoff import crops, effects, plot, report
 from endotwin.tradeoff.ladder import Rung
@@ -48,15 +50,25 @@ def tradeoff(
         one row a rung, as ``summary`` makes them; one row an effect, as ``effects.rows`` does.
 
     Raises:
-        SequenceError: no such sequence. OutputError: ``out`` is taken, or ``out.partial`` is another
-        sequence's. RungError: a command failed; what was measured before stays in ``out.partial``.
+        OptionError: no such geometry. SequenceError: no such sequence, or a frame of it cannot be read.
+        OutputError: ``out`` is taken, or ``out.partial`` is another sequence's. RungError: a command failed;
+        what was measured before stays in ``out.partial``.
     """
     check_free(out, overwrite, TRADEOFF)
+    if geometry not in GEOMETRIES:
+        raise OptionError(f"geometry {geometry!r} is unknown; choose one of {', '.join(GEOMETRIES)}")
     sequence = open_sequence(path)
     sequence.require_valid_depth()
+    asked = {
+        "sequence": str(path.resolve()),
+        "checksum": checksum(sequence, fingerprints(sequence)),
+        "geometry": geometry,
+    }
+    patch = crops.telling_patch(sequence, Source(str(path), sequence.format))
     work = out.with_name(out.name + PARTIAL)
     try:
-        return _climbed(sequence, path, work, out, rungs, repeats, geometry, progress, base)
+        _enter(work, asked)
+        return _climbed(sequence, path, patch, work, out, rungs, repeats, geometry, progress, base)
     except OSError as error:
         told = unwritable(Path(error.filename or work), error)
         raise OutputError(f"{told}; the same command goes on from {work}") from error
@@ -65,6 +77,7 @@ def tradeoff(
 def _climbed(
     sequence: Sequence,
     path: Path,
+    patch: crops.Patch,
     work: Path,
     out: Path,
     rungs: list[Rung],
@@ -74,8 +87,6 @@ def _climbed(
     base: Rung | None,
 ) -> tuple[list[dict], list[dict]]:
     """What ``tradeoff`` does, in the folder ``work`` and at last in ``out``."""
-    _enter(work, {"sequence": str(path.resolve()), "geometry": geometry})
-    patch = crops.telling_patch(sequence, Source(str(path), sequence.format))
     runs = [(repeat, rung) for repeat in range(repeats) for rung in rungs]
     try:
         for done, (repeat, rung) in enumerate(runs):
@@ -118,8 +129,8 @@ def _climbed(
 
 
 def _enter(work: Path, asked: dict) -> None:
-    """Make the working folder, or go on in it if it was made for the same sequence and geometry."""
-    if goes_on(work, TRADEOFF, asked, "another sequence or geometry"):
+    """Make the working folder, or go on in it if it was made for the same frames and geometry."""
+    if goes_on(work, TRADEOFF, asked, "another sequence or geometry, or of other frames"):
         return
     for folder in ("rungs", "results", "crops"):
         (work / folder).mkdir(parents=True, exist_ok=True)

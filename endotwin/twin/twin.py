@@ -138,6 +138,11 @@ class Source:
 
     def open(self) -> Sequence:
         """The sequence; raises SequenceError if it has moved or changed its shape."""
+        if not Path(self.path).exists():
+            raise SequenceError(
+                f"{self.path}, from which the twin was made, is gone; put it back, or make the twin again "
+                "with 'endotwin fuse'"
+            )
         return open_sequence(Path(self.path), self.format, self.scale, self.undistort)
 
     def heldout(self, count: int) -> list[int]:
@@ -353,8 +358,9 @@ class Twin:
                 f"{path} is a damaged twin ({error.filename} is gone); make it again with 'endotwin fuse'"
             ) from error
         except (OSError, KeyError, TypeError, ValueError, AttributeError, SafetensorError) as error:
+            what = f"it has no {error}" if isinstance(error, KeyError) else error
             raise TwinError(
-                f"{path} is a damaged twin ({error}); make it again with 'endotwin fuse'"
+                f"{path} is a damaged twin ({what}); make it again with 'endotwin fuse'"
             ) from error
 
 
@@ -412,8 +418,9 @@ def _read_document(path: Path) -> dict:
     except NotADirectoryError:
         raise TwinError(f"{path} is a file; give the folder of the twin") from None
     except FileNotFoundError:
+        name = "TWIN" if path.exists() else path
         raise TwinError(
-            f"{path} is not a twin (it has no twin.json); make one with 'endotwin fuse SEQUENCE -o {path}'"
+            f"{path} is not a twin (it has no twin.json); make one with 'endotwin fuse SEQUENCE -o {name}'"
         ) from None
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise TwinError(

@@ -1,5 +1,7 @@
 """Fixtures of the stability suite."""
 
+from collections.abc import Iterator
+
 import pytest
 import torch
 
@@ -11,3 +13,10 @@ def one_thread():
     torch.set_num_threads(1)
     yield
     torch.set_num_threads(threads)
+
+
+@pytest.fixture(scope="module")
+def monkeypatch_module() -> Iterator[pytest.MonkeyPatch]:
+    """``monkeypatch`` of a whole test module."""
+    with pytest.MonkeyPatch.context() as patch:
+        yield patch

@@ -75,9 +75,11 @@ def _detected(path: Path) -> ModuleType:
     for reader in FORMATS.values():
         if reader.detects(path):
             return reader
-    if path.is_dir() and not any(path.iterdir()):
+    if path.is_file():
+        raise SequenceError(f"{path} is a file; name the folder that holds the sequence")
+    if not any(path.iterdir()):
         raise SequenceError(f"{path} is empty and has no frames; name the folder that holds the photos")
-    inside = sorted(entry for entry in path.iterdir() if entry.is_dir()) if path.is_dir() else []
+    inside = sorted(entry for entry in path.iterdir() if entry.is_dir())
     for folder in inside:
         if any(reader.detects(folder) for reader in FORMATS.values()):
             raise SequenceError(f"{path} has no frames itself, but {folder.name} in it has; name {folder}")

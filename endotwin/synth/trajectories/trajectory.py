@@ -103,7 +103,9 @@ def parse_trajectory(
     if made_up:
         return _given(poses, frame_times(len(poses)), spec, "poses of an array", gate)
     if kind not in KINDS:
-        return _given(*read_poses(spec), spec, f"poses of the file {Path(spec).name}", gate)
+        poses, timestamps_s = read_poses(spec)
+        _warn_of_metres(spec, poses, twin)
+        return _given(poses, timestamps_s, spec, f"poses of the file {Path(spec).name}", gate)
     if kind == "spline":
         name, _, text = text.partition(",")
         if not Path(name).is_file():
@@ -138,6 +140,9 @@ VALUES = {int: int, float: float, bool: {"true": True, "false": False}.__getitem
 GREATEST = 1e7
 """Above any number of millimetres or degrees that makes sense; infinity and NaN fail too."""
 
+IN_METRES = 2e-3
+"""Of the surface's extent: a path in mm that is read in metres reaches less far."""
+
 MOST_FRAMES = 100_000
 """Poses are kept in memory; more frames are made as several datasets, each with a seed of its own."""
 
@@ -170,11 +175,23 @@ def parse_options(
         least = -GREATEST if known[key].metadata.get("signed") else 0
         most = MOST_FRAMES if key == "frames" else GREATEST
         if not least <= values[key] <= most:
+            switch = isinstance(known[key].default, bool)
+            range_ = "is true or false" if switch else f"lies between {least:g} and {most:g}"
             raise error(
                 f"{what} {spec!r}: {value!r} is no value for {key} ({known[key].metadata['help']}), "
-                f"which lies between {least:g} and {most:g}"
+                f"which {range_}"
             )
     return options(**values)
+
+
+def _warn_of_metres(spec: str, poses: np.ndarray, twin: Twin) -> None:
+    """Warn of a path that is a point beside the surface, and would not be if its unit were metres."""
+    span_mm = float(np.ptp(poses[:, :3, 3], axis=0).max())
+    if 0 < span_mm < IN_METRES * float(np.ptp(twin.surface.vertices_mm, axis=0).max()):
+        log.warning(
+            "the poses of %s lie within %.2g mm of each other: if they are in metres, write them in mm",
+            *(spec, span_mm),
+        )
 
 
 def _kept(

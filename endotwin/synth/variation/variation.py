@@ -180,7 +180,9 @@ def read_variation(path: Path, twin: Twin, before: Variation) -> Variation:
     """
     try:
         content = parsed(Path(path).read_text(encoding="utf-8-sig")) or {}
-    except (OSError, ValueError) as error:
+    except OSError as error:
+        raise OptionError(f"{path} cannot be read ({error.strerror}); check its name") from error
+    except ValueError as error:
         raise OptionError(f"{path} cannot be read as YAML ({error}); check the file") from error
     _require_mapping(content, KEYS, str(path))
     kinds = {kind: _ranges(content.get(kind), kind, kind, path) for kind in NAMES}
