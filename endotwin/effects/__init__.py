@@ -16,7 +16,7 @@ from endotwin.errors import OptionError
 FITTED = ("specular", "offset", "shadows", "interreflection", "gain", "vignetting", "profile", "coat", "film")
 RENDERED = (
     *("noise", "motion_blur", "defocus", "rolling_shutter", "chromatic", "bloom", "lens"),
-    *("processor", "codec"),
+    *("processor", "codec", "video"),
 )
 NAMES = (*FITTED, *RENDERED)
 

@@ -8,7 +8,7 @@ on its way in this order:
 - when pixels see it (motion blur, rolling shutter);
 - what the lens makes of the radiance image (vignetting, defocus, chromatic, bloom, lens);
 - what the sensor makes of that (gain, noise);
-- what becomes of the picture afterwards (processor, codec).
+- what becomes of the picture afterwards (processor, codec, video).
 """
 
 from __future__ import annotations

@@ -8,6 +8,7 @@ from functools import cached_property
 import numpy as np
 
 from endotwin.effects.exposure import following
+from endotwin.effects.video import Clip
 from endotwin.errors import OptionError
 from endotwin.light.incidence import to_camera
 from endotwin.render import Renderer, View
@@ -105,8 +106,9 @@ class Labeller:
         self._T_world_next = following(job.trajectory.T_world_camera)
         self._shaded: tuple[object, Renderer, Renderer | None] | None = None
 
-    def frame(self, index: int) -> dict[str, np.ndarray]:
-        """The images of frame ``index`` by name, as ``LABELS`` has them."""
+    def frame(self, index: int, clip: Clip | None = None) -> dict[str, np.ndarray]:
+        """The images of frame ``index`` by name, as ``LABELS`` has them; ``clip``: that its photo is the next
+        picture of."""
         job = self._job
         T_world_camera = job.trajectory.T_world_camera[index]
         images, view = {}, None
@@ -118,7 +120,7 @@ class Labeller:
         if PHOTOS & set(job.labels):
             generator = Stream.SENSOR.generator(job.document["seed"], index)
             color, radiance = photographed(
-                renderer, view, T_world_camera, self._T_world_next[index], generator
+                renderer, view, T_world_camera, self._T_world_next[index], generator, clip
             )
             images = {"rgb": color, "rgb_linear": radiance, "rgb_exr": radiance}
         if specular_free is not None:

@@ -6,6 +6,7 @@ import logging
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
+from threading import local
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -174,7 +175,7 @@ class Body:
     def __init__(self, rest: Surface, motion: Motion | None, times_s: np.ndarray):
         self._motion, self._times_s = motion, times_s
         self._still = Caster(rest, threads=1)
-        self._casters: dict[float, Caster] = {}
+        self._kept = local()  # a thread's own: another's rays are under way in its casters
 
     @property
     def moves(self) -> bool:
@@ -191,17 +192,18 @@ class Body:
         if self._motion is None:
             return self._still
         time_s = float(self._times_s[index])
-        caster = self._casters.pop(time_s, None)
+        casters = vars(self._kept).setdefault("casters", {})
+        caster = casters.pop(time_s, None)
         if caster is None:
-            caster = self._unused().moved(self._motion.surface(time_s))
-        self._casters[time_s] = caster
+            caster = self._unused(casters).moved(self._motion.surface(time_s))
+        casters[time_s] = caster
         return caster
 
-    def _unused(self) -> Caster:
+    def _unused(self, casters: dict[float, Caster]) -> Caster:
         """A caster whose place another may take: a new one, or that of the frame asked for longest ago."""
-        if len(self._casters) < KEPT:
+        if len(casters) < KEPT:
             return Caster(self._still.surface, threads=1)
-        return self._casters.pop(next(iter(self._casters)))
+        return casters.pop(next(iter(casters)))
 
 
 def parse_motion(specs: Iterable[str] | str, twin: Twin) -> Motion | None:

@@ -13,6 +13,7 @@ import numpy as np
 import trimesh
 
 from endotwin.cameras import Camera
+from endotwin.effects.video import CLIP_FRAMES, Video
 from endotwin.errors import EndotwinError, OptionError, OutputError, TwinError
 from endotwin.run.output import DATASET, check_apart, unwritable
 from endotwin.run.threads import cores
@@ -147,17 +148,21 @@ def make_job(
     refusal = LAYOUTS[layout].refusal(camera, labels)
     if refusal:
         raise OptionError(f"layout {layout}: {refusal}")
+    draws = variation.draw(len(trajectory), seed)
+    filmed = "video" in twin.effects or any(("video", True) in draw.effects for draw in draws)
+    if filmed:
+        Video.require_encoder()
     return Job(
         twin=twin,
         camera=camera,
         trajectory=trajectory,
-        draws=variation.draw(len(trajectory), seed),
+        draws=draws,
         regions=variation.regions,
         labels=labels,
         images=tuple(dict.fromkeys(image for label in labels for image in LABELS[label])),
         layout=layout,
-        shard_frames=LAYOUTS[layout].shard_frames,
-        document=describe(twin, trajectory, seed, labels, layout, camera, variation, motion),
+        shard_frames=max(LAYOUTS[layout].shard_frames, CLIP_FRAMES if filmed else 0),
+        document=describe(twin, trajectory, seed, labels, layout, camera, variation, motion, filmed),
         motion=motion,
     )
 
