@@ -151,6 +151,12 @@ class Renderer:
         )
         return other
 
+    def brighter(self, gain: float) -> Renderer:
+        """The renderer of the same twin with so many times the light."""
+        other = copy(self)
+        other._exposure = self._exposure * np.float32(gain)
+        return other
+
     def through(self, camera: Camera) -> Renderer:
         """The renderer of the same twin through another camera."""
         if camera is self.camera:

@@ -333,6 +333,12 @@ ENCODINGS: dict[str, Encoding] = {
         "materials are a guess); 64: filled in (its shape is a guess too); 0: no surface",
         pixels,
     ),
+    "overlay": Encoding(
+        ".png",
+        png,
+        "8-bit: 255: the processor's overlay hides what the photo would show here; 0: it does not",
+        pixels,
+    ),
     "triangles": Encoding(
         ".tiff",
         lambda triangle: tiff(triangle, **DEFLATE),

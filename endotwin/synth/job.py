@@ -32,6 +32,7 @@ class Job:
         shard_frames: frames that are rendered, and counted as done, together: a clip, where they are
             recorded as a video.
         document: the content of ``dataset.json``. motion: of the tissue; None: it is still.
+        gains: float [N], on the light of each frame, where the camera sets them itself; None: 1.
     """
 
     twin: Twin
@@ -45,6 +46,7 @@ class Job:
     shard_frames: int
     document: dict
     motion: Motion | None = None
+    gains: np.ndarray | None = None
 
     def __len__(self) -> int:
         return len(self.trajectory)

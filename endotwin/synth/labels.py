@@ -45,6 +45,7 @@ LABELS: dict[str, tuple[str, ...]] = {
     "flow_forward_npz": ("flow_forward_npz", "flow_forward_hidden"),
     "occlusion": ("occlusion",),
     "triangles": ("triangles",),
+    "overlay": ("overlay",),
     "scene_flow": ("scene_flow",),
     "scene_flow_forward": ("scene_flow_forward",),
     "vertices": ("vertices",),
@@ -67,7 +68,7 @@ HIGHLIGHT = 0.1
 
 PHOTOS = {"rgb", "rgb_linear", "rgb_exr"}
 SPLIT = {"diffuse", "specular"}
-SHADED = PHOTOS | SPLIT | {"albedo", "roughness", "metallic"}
+SHADED = PHOTOS | SPLIT | {"albedo", "roughness", "metallic", "overlay"}
 """Labels that need a photo, those of its parts, and all that need the frame's draw."""
 
 
@@ -114,7 +115,7 @@ class Labeller:
         images, view = {}, None
         renderer = specular_free = None
         if SHADED & set(job.labels):
-            renderer, specular_free = self._renderers(index)
+            renderer, specular_free = self.renderers(index)
         if (PHOTOS | {"specular"}) & set(job.labels):
             view = renderer.view(T_world_camera)
         if PHOTOS & set(job.labels):
@@ -138,7 +139,7 @@ class Labeller:
                 images[name] = getattr(geometry, name)
         return {name: images[name] for name in job.images}
 
-    def _renderers(self, index: int) -> tuple[Renderer, Renderer | None]:
+    def renderers(self, index: int) -> tuple[Renderer, Renderer | None]:
         """The renderer of the frame's draw, and the one without specular reflection if that is asked for."""
         draw = self._job.draws[index]
         kept = self._shaded
@@ -154,10 +155,13 @@ class Labeller:
                 matt = replace(twin, materials=matt, effects=twin.effects.without(MIRRORS))
                 specular_free = renderer.edited(matt, exposure)
             kept = self._shaded = (draw, renderer, specular_free)
-        if not self._body.moves:
-            return kept[1:]
-        caster = self._body.at(index)
-        return tuple(None if renderer is None else renderer.moved(caster) for renderer in kept[1:])
+        renderers = kept[1:]
+        if self._body.moves:
+            caster = self._body.at(index)
+            renderers = tuple(renderer and renderer.moved(caster) for renderer in renderers)
+        if self._job.gains is None:
+            return renderers
+        return tuple(renderer and renderer.brighter(self._job.gains[index]) for renderer in renderers)
 
 
 class _Geometry:
@@ -226,6 +230,13 @@ class _Geometry:
     @property
     def triangles(self) -> np.ndarray:
         return self._image(self._hits.triangle, -1)
+
+    @property
+    def overlay(self) -> np.ndarray:
+        height, width = self._job.camera.height, self._job.camera.width
+        effect = self._renderer.twin.effects.get("overlay")
+        hidden = np.zeros((height, width), bool) if effect is None else effect.hides(height, width)
+        return np.where(hidden, np.uint8(255), np.uint8(0))
 
     @property
     def occlusion(self) -> np.ndarray:

@@ -17,7 +17,7 @@ EXPOSURE = ("motion_blur", "rolling_shutter")
 OPTICS = ("defocus", "chromatic", "bloom", "lens")
 """In the order in which light meets them."""
 
-RECORDING = ("processor", "codec", "video")
+RECORDING = ("processor", "overlay", "codec", "video")
 """In the order in which the picture meets them."""
 
 
@@ -38,14 +38,22 @@ def photographed(
     effects, camera = renderer.twin.effects, renderer.camera
     if not set(effects) & set(RENDERED):
         return view.color, view.radiance
-    radiance = torch.from_numpy(view.radiance)
     timed = [effects[name] for name in EXPOSURE if name in effects]
-    if timed:
-        shot = Shot(camera, T_world_camera, T_world_next, view.depth_mm)
-        radiance = expose(lambda T, mask: torch.from_numpy(renderer.view(T, mask).radiance), shot, timed)
-    for name in OPTICS:
-        if name in effects:
-            radiance = effects[name].through(radiance, view.depth_mm, camera)
+
+    def seen(shot: Shot) -> torch.Tensor:
+        """The radiance image on the sensor."""
+        radiance = expose(film, shot, timed)
+        for name in OPTICS:
+            if name in effects:
+                radiance = effects[name].through(radiance, view.depth_mm, camera)
+        return radiance
+
+    def film(T: np.ndarray, mask: np.ndarray | None) -> torch.Tensor:
+        known = mask is None and T is T_world_camera
+        return torch.from_numpy((view if known else renderer.view(T, mask)).radiance)
+
+    shot = Shot(camera, T_world_camera, T_world_next, view.depth_mm)
+    radiance = effects["interlacing"].woven(seen, shot) if "interlacing" in effects else seen(shot)
     color = shading.respond(radiance, renderer.twin.response.gamma).clamp(0, 1).numpy()
     if "noise" in effects:
         color = effects["noise"].read(color, generator)

@@ -21,6 +21,7 @@ from endotwin.synth.encodings import FLOW_RANGE_PX
 from endotwin.synth.job import Job
 from endotwin.synth.labels import DEFAULT_LABELS, LABELS, OF_MOTION
 from endotwin.synth.layouts import LAYOUTS
+from endotwin.synth.metering import metered
 from endotwin.synth.motion import Motion
 from endotwin.synth.proof import Proof, Written, prove
 from endotwin.synth.proof.written import read_records
@@ -149,10 +150,11 @@ def make_job(
     if refusal:
         raise OptionError(f"layout {layout}: {refusal}")
     draws = variation.draw(len(trajectory), seed)
-    filmed = "video" in twin.effects or any(("video", True) in draw.effects for draw in draws)
+    used = {*twin.effects, *(name for draw in draws for name, on in draw.effects if on)}
+    filmed = "video" in used
     if filmed:
         Video.require_encoder()
-    return Job(
+    job = Job(
         twin=twin,
         camera=camera,
         trajectory=trajectory,
@@ -165,6 +167,7 @@ def make_job(
         document=describe(twin, trajectory, seed, labels, layout, camera, variation, motion, filmed),
         motion=motion,
     )
+    return metered(job) if "auto_gain" in used else job
 
 
 def _render(

@@ -26,7 +26,7 @@ LICENSE_NOTE = (
 COMMON_WORDS = {
     "frames": "frames.jsonl: a JSON object a frame: index, pose (its number in the trajectory that was "
     "asked for), timestamp_s, T_world_camera (4x4, row by row, mm, OpenCV "
-    "axes), checks of the pose, and the edits that were drawn for it",
+    "axes), checks of the pose, the automatic gain if there is one, and the edits that were drawn for it",
     "document": "dataset.json: this; datasheet.html: pictures and histograms",
 }
 

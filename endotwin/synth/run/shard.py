@@ -27,6 +27,8 @@ def frame_record(job: Job, index: int) -> dict:
         "T_world_camera": trajectory.T_world_camera[index].tolist(),
         "checks": {name: round(float(values[index]), 4) for name, values in trajectory.checks.items()},
     }
+    if job.gains is not None:
+        record["gain"] = float(job.gains[index])
     return {**record, **job.draws[index].to_dict(job.regions)}
 
 
