@@ -15,6 +15,7 @@ import torch
 from endotwin.cameras import Camera
 from endotwin.errors import OptionError, TwinError
 from endotwin.light import shading
+from endotwin.light.forward import Lit
 from endotwin.light.incidence import to_camera
 from endotwin.render.illumination import Illumination, ViewLight
 from endotwin.run.threads import THREADS
@@ -178,8 +179,8 @@ class Renderer:
 
         Colours of pixels at silhouettes and shadow edges (and of those beside the mask's edge), and only
         those, are means over the pixel's area; labels are of its centre. ``exposure`` is a factor on the
-        radiance of this view. ``like`` is a view from there by a renderer of the same twin with other lobes:
-        what its rays met is not looked for again.
+        radiance of this view. ``like`` is a view from there by a renderer of the same twin with other lobes,
+        through the same camera: what its rays met, and how that is lit, is not looked for again.
 
         Raises:
             TrajectoryError: that is no rigid pose. OptionError: the mask has another shape than the image.
@@ -252,8 +253,8 @@ class Renderer:
         mixed = hits.interpolate(self.twin.surface, self._normal_and_material)
         normals = to_camera(mixed[:, :3], T_world_camera)
         facing = -dot(normals, rays.pixel_directions.reshape(-1, 3).take(hits.pixel, axis=0)) > FACING
-        visible = light.visible(hits, rays.pixel_directions)
-        return _Points(rays, hits, normals, torch.from_numpy(mixed[:, 3:]), facing, visible)
+        lit, visible = light.lit(hits, rays.pixel_directions, normals)
+        return _Points(hits, normals, torch.from_numpy(mixed[:, 3:]), facing, lit, visible)
 
 
 @dataclass(frozen=True, eq=False)
@@ -262,21 +263,20 @@ class _Points:
 
     Attributes:
         hits: N of them. normals: float32 [N, 3], unit, in the camera frame. material: base colour, roughness
-            and metallic, [N, 5]. facing: bool [N], those that face their ray.
-        visible: which light guides they see, [N, K]; None where no shadow is cast.
+            and metallic, [N, 5]. facing: bool [N], those that face their ray. lit: what the light guides do.
+        visible: which guides they see, [N, K]; None where no shadow is cast.
     """
 
-    rays: Camera | Rays
     hits: Correspondences
     normals: np.ndarray
     material: torch.Tensor
     facing: np.ndarray
+    lit: Lit
     visible: np.ndarray | None
 
     def radiance(self, light: ViewLight) -> np.ndarray:
         """Float32 [N, 3]."""
-        directions = self.rays.pixel_directions
-        return light.radiance(self.hits, directions, self.normals, self.material, self.visible).numpy()
+        return light.radiance(self.hits, self.lit, self.material).numpy()
 
 
 @dataclass(frozen=True, eq=False)
@@ -297,7 +297,7 @@ class _Met:
     def mean_radiance(self, light: ViewLight) -> tuple[np.ndarray, np.ndarray]:
         """Radiance float32 [E, 3] of the edges, averaged over the rays that meet a surface which faces them,
         and how many do, [E]."""
-        facing, (edges, inside) = self.within.facing, self.within.rays.pixel_directions.shape[:2]
+        facing, edges, inside = self.within.facing, np.count_nonzero(self.edges), SUBPIXELS**2
         pixel = self.within.hits.pixel[facing]
         total = laid_out(self.within.radiance(light)[facing], pixel, (edges, inside)).sum(axis=1)
         count = np.bincount(pixel // inside, minlength=edges).astype(np.float32)
