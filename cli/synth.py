@@ -15,7 +15,7 @@ from endotwin.run.output import DATASET, check_apart, check_free, check_picture
 LABELS = (
     "rgb, rgb_linear, rgb_exr, depth, depth_exr, normals, mask, albedo, roughness, metallic, diffuse, "
     "specular, flow, flow_forward, flow_exr, flow_npz, flow_forward_exr, flow_forward_npz, occlusion, "
-    "triangles; of motion scene_flow, scene_flow_forward, vertices; 'all'"
+    "triangles, overlay; of motion scene_flow, scene_flow_forward, vertices; 'all'"
 )
 
 

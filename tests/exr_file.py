@@ -1,13 +1,13 @@
-"""A reader of OpenEXR files that shares no code with the library: scan lines, ZIP ("OpenEXR File Layout",
-openexr.com)."""
+"""A reader of OpenEXR files that shares no code with the library: scan lines, ZIP or none ("OpenEXR File
+Layout", openexr.com)."""
 
 import struct
 import zlib
 
 import numpy as np
 
-LINES = 16
-"""Scan lines of a block."""
+LINES = {b"\0": 1, b"\3": 16}
+"""Scan lines of a block, by compression."""
 
 DTYPES = {1: np.dtype("<f2"), 2: np.dtype("<f4")}
 
@@ -22,14 +22,14 @@ def read(content: bytes) -> tuple[dict[str, bytes], dict[str, np.ndarray]]:
         (size,) = struct.unpack_from("<I", content, at)
         attributes[name.decode()] = content[at + 4 : at + 4 + size]
         at += 4 + size
-    assert attributes["compression"] == b"\3"
+    of_block = LINES[attributes["compression"]]
     left, top, right, bottom = struct.unpack("<4i", attributes["dataWindow"])
     width, height = right - left + 1, bottom - top + 1
     names = _channels(attributes["channels"])
     planes = {name: np.empty((height, width), dtype) for name, dtype in names.items()}
-    for offset in struct.unpack_from(f"<{-(-height // LINES)}Q", content, at + 1):
+    for offset in struct.unpack_from(f"<{-(-height // of_block)}Q", content, at + 1):
         first, size = struct.unpack_from("<iI", content, offset)
-        lines = range(first - top, min(first - top + LINES, height))
+        lines = range(first - top, min(first - top + of_block, height))
         expected = len(lines) * width * sum(dtype.itemsize for dtype in names.values())
         block = _inflated(content[offset + 8 : offset + 8 + size], expected)
         for line in lines:

@@ -1,11 +1,13 @@
 """Embree hits against Open3D's ray caster and against geometry."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import scenes
 
 from endotwin.fusion._open3d import o3c, o3d
-from endotwin.surface import Surface
+from endotwin.surface import Surface, refit
 from endotwin.surface.casting import Caster
 
 
@@ -51,6 +53,45 @@ def test_barycentrics_give_back_the_hit_point(surface):
     np.testing.assert_allclose(points, origins + distance_mm[:, None] * directions, atol=1e-3)
     np.testing.assert_allclose(barycentric.sum(axis=1), 1, atol=1e-6)
     assert (barycentric >= 0).all()
+
+
+def swollen(surface: Surface, share: float) -> Surface:
+    """The surface with a wave along z, and aside: what motion does to tissue."""
+    wave = 1 + share * np.sin(surface.vertices_mm[:, 2:])
+    moved = surface.vertices_mm * wave + np.float32([5 * share, 0, 0])
+    return replace(surface, vertices_mm=moved.astype(np.float32))
+
+
+@pytest.mark.parametrize("known", [True, False], ids=["refitted", "built anew"])
+def test_a_moved_casters_hits_are_those_of_a_new_one_whatever_it_was_before(surface, known, monkeypatch):
+    if not known:
+        monkeypatch.setattr(refit, "_library", lambda: None)
+    origins, directions = random_rays(50_000)
+    caster = Caster(surface)
+    for share in (0.3, -0.2, 0.1):
+        there = swollen(surface, share)
+        caster = caster.moved(there)
+        assert (caster._refit is not None) == known
+        assert caster.surface is there
+        expected = Caster(there)
+        for found, right in zip(
+            caster.cast_rays(origins, directions), expected.cast_rays(origins, directions), strict=True
+        ):
+            np.testing.assert_array_equal(found, right)
+        length_mm = np.full(len(origins), 14, np.float32)
+        np.testing.assert_array_equal(
+            caster.unobstructed(origins, directions, length_mm),
+            expected.unobstructed(origins, directions, length_mm),
+        )
+
+
+def test_what_is_hit_on_shared_edges_does_not_depend_on_where_a_moved_caster_was_before(surface):
+    """Rays at vertices of the moved surface hit one of six triangles: always the same one."""
+    there = swollen(surface, 0.1)
+    towards = there.vertices_mm / np.linalg.norm(there.vertices_mm, axis=1, keepdims=True)
+    origins = np.zeros_like(towards)
+    one, other = Caster(surface).moved(there), Caster(surface).moved(swollen(surface, -0.3)).moved(there)
+    np.testing.assert_array_equal(one.cast_rays(origins, towards)[0], other.cast_rays(origins, towards)[0])
 
 
 def test_no_ray_slips_through_shared_edges_and_vertices(surface):

@@ -23,7 +23,7 @@ from endotwin.surface import Surface
 from endotwin.surface.casting import Caster, surface_points
 from endotwin.synth import LABELS, Trajectory, Variation, parse_labels, synthesize
 from endotwin.synth.encodings import ENCODINGS, encode_flow, encode_normals
-from endotwin.synth.flow import seen_from
+from endotwin.synth.flow import projected, seen_from
 from endotwin.synth.labels import (
     HIDDEN_NO,
     HIDDEN_NONE,
@@ -228,9 +228,11 @@ def test_a_hidden_point_is_one_that_a_ray_does_not_reach(folded):
     caster = Caster(twin.surface)
     hits = caster.cast(twin.camera, poses[0])
     points = surface_points(twin.surface, hits)
-    assert seen_from(points, caster, twin.camera, poses[0]).mean() > 0.999
+    uv = projected(points, twin.camera, poses[0])
+    assert seen_from(points, uv, caster, twin.camera, poses[0]).mean() > 0.999
     turned = poses[0] @ np.diag([-1.0, 1, -1, 1])
-    assert not seen_from(points, caster, twin.camera, turned).any()
+    uv = projected(points, twin.camera, turned)
+    assert not seen_from(points, uv, caster, twin.camera, turned).any()
 
 
 def test_flow_beyond_20_px_and_none_are_0_and_the_rest_reads_back():

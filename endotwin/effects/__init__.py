@@ -15,8 +15,18 @@ from endotwin.errors import OptionError
 
 FITTED = ("specular", "offset", "shadows", "interreflection", "gain", "vignetting", "profile", "coat", "film")
 RENDERED = (
-    *("noise", "motion_blur", "defocus", "rolling_shutter", "chromatic", "bloom", "lens"),
-    *("processor", "codec"),
+    *(
+        "auto_gain",
+        "noise",
+        "motion_blur",
+        "defocus",
+        "rolling_shutter",
+        "interlacing",
+        "chromatic",
+        "bloom",
+        "lens",
+    ),
+    *("processor", "overlay", "codec", "video"),
 )
 NAMES = (*FITTED, *RENDERED)
 

@@ -5,10 +5,10 @@ on its way in this order:
 
 - where it comes from and how it falls (offset, profile, shadows, interreflection);
 - how tissue answers it (specular, coat);
-- when pixels see it (motion blur, rolling shutter);
+- when pixels see it (motion blur, rolling shutter, interlacing);
 - what the lens makes of the radiance image (vignetting, defocus, chromatic, bloom, lens);
-- what the sensor makes of that (gain, noise);
-- what becomes of the picture afterwards (processor, codec).
+- what the sensor makes of that (gain, auto_gain, noise);
+- what becomes of the picture afterwards (processor, overlay, codec, video).
 """
 
 from __future__ import annotations

@@ -108,50 +108,47 @@ class ViewLight:
     irradiance: np.ndarray | None
     film: np.ndarray | None
 
-    def radiance(
-        self, hits: Correspondences, directions: np.ndarray, normals: np.ndarray, material: Tensor
-    ) -> tuple[Tensor, np.ndarray | None]:
-        """Radiance of hits.
+    def lit(
+        self, hits: Correspondences, directions: np.ndarray, normals: np.ndarray
+    ) -> tuple[Lit, np.ndarray | None]:
+        """What the guides do to hits, without what comes from other tissue.
 
         Args:
             directions: unit viewing rays of all pixels, float32 [..., 3]. normals: float32 [N, 3]; both in
-                the camera frame. material: base colour, roughness and metallic of the hits, [N, 5].
+                the camera frame.
 
         Returns:
-            float32 [N, 3]; and which guides each point sees, float32 [N, K] (None where no shadow is cast).
+            it; and which guides each point sees, float32 [N, K] (None where no shadow is cast).
         """
-        twin, roughness = self.twin, material[:, 3]
-        more = {}
-        if self.irradiance is not None:
-            gloss = shading.specular_of_even_light(
-                _cos_o(hits, directions, normals), roughness, twin.materials.f0
-            )
-            bounced = torch.from_numpy(hits.interpolate(twin.surface, self.irradiance))
-            more = {"irradiance": bounced, "gloss": gloss}
-        lit, visible = self._lit(hits, directions, normals, more)
-        base_color = material[:, :3] * (1 - material[:, 4:])
-        x = radiance(lit, _log_light(twin), base_color, roughness, _lobes(twin))
-        if self.film is not None:
-            x = x + torch.from_numpy(hits.interpolate(twin.surface, self.film))[:, None]
-        return x, visible
-
-    def _lit(
-        self, hits: Correspondences, directions: np.ndarray, normals: np.ndarray, more: dict[str, Tensor]
-    ) -> tuple[Lit, np.ndarray | None]:
-        """What lights the hits, with what comes from other tissue in ``more``; and which guides they see."""
         effects = self.twin.effects
         if effects.guides_mm is None:
             geometry = incidence_on(normals, hits, directions)
             if effects.profile != COSINE:
                 axis = log_axis(np.exp(geometry.log_cos_axis), effects.profile)
                 geometry = replace(geometry, log_cos_axis=axis)
-            return Lit.at_lens(*(torch.from_numpy(value) for value in vars(geometry).values()), **more), None
-        points_mm = directions.reshape(-1, 3).take(hits.pixel, axis=0) * hits.distance_mm[:, None]
+            return Lit.at_lens(*(torch.from_numpy(value) for value in vars(geometry).values())), None
+        view = directions.reshape(-1, 3).take(hits.pixel, axis=0)
+        points_mm = view * hits.distance_mm[:, None]
         guides_mm, visible = np.asarray(effects.guides_mm, np.float32), None
         if "shadows" in effects:
             visible = visible_from(self.caster, self.T_local_camera, points_mm, guides_mm)
         guides = guided(points_mm, normals, guides_mm, effects.profile, visible)
-        return Lit(_cos_o(hits, directions, normals), guides, **more), visible
+        cos_o = np.clip(-dot(normals, view), COS_MIN, 1)
+        return Lit(torch.from_numpy(cos_o), guides), visible
+
+    def radiance(self, hits: Correspondences, lit: Lit, material: Tensor) -> Tensor:
+        """Radiance of hits, float32 [N, 3], that the guides light so; ``material``: base colour, roughness
+        and metallic of the hits, [N, 5]."""
+        twin, roughness = self.twin, material[:, 3]
+        if self.irradiance is not None:
+            gloss = shading.specular_of_even_light(lit.cos_o.clamp(max=1), roughness, twin.materials.f0)
+            bounced = torch.from_numpy(hits.interpolate(twin.surface, self.irradiance))
+            lit = replace(lit, irradiance=bounced, gloss=gloss)
+        base_color = material[:, :3] * (1 - material[:, 4:])
+        x = radiance(lit, _log_light(twin), base_color, roughness, _lobes(twin))
+        if self.film is not None:
+            x = x + torch.from_numpy(hits.interpolate(twin.surface, self.film))[:, None]
+        return x
 
 
 def _log_light(twin: Twin) -> tuple[float, float, float]:
@@ -170,9 +167,3 @@ def _albedo(twin: Twin, radiosity: Radiosity) -> np.ndarray:
     diffuse = torch.from_numpy(materials.base_color * (1 - materials.metallic)[:, None])
     roughness = torch.from_numpy(materials.roughness)
     return Albedo.of(radiosity, diffuse, roughness, materials.f0, twin.surface.triangles).scaled(0.0)
-
-
-def _cos_o(hits: Correspondences, directions: np.ndarray, normals: np.ndarray) -> Tensor:
-    """n·wo of hits, float32 [N], at least COS_MIN."""
-    view = directions.reshape(-1, 3).take(hits.pixel, axis=0)
-    return torch.from_numpy(np.clip(-(normals * view).sum(axis=1), COS_MIN, 1))

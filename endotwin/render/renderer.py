@@ -15,6 +15,7 @@ import torch
 from endotwin.cameras import Camera
 from endotwin.errors import OptionError, TwinError
 from endotwin.light import shading
+from endotwin.light.forward import Lit
 from endotwin.light.incidence import to_camera
 from endotwin.render.illumination import Illumination, ViewLight
 from endotwin.run.threads import THREADS
@@ -55,7 +56,7 @@ class View:
     hits: Correspondences
     shape: tuple[int, int]
     _renderer: Renderer
-    _normals: np.ndarray
+    _met: _Met
 
     def image(self, values: np.ndarray, empty: float = 0.0) -> np.ndarray:
         """Values of the hits, [N, ...], as an image [H, W, ...] with ``empty`` where no surface is seen."""
@@ -75,12 +76,17 @@ class View:
     @cached_property
     def normals(self) -> np.ndarray:
         """Float32 [H, W, 3], unit normals in the camera frame; 0 where no surface is seen."""
-        return self.image(self._normals)
+        return self.image(self._met.centres.normals)
 
     @cached_property
     def albedo(self) -> np.ndarray:
         """Float32 [H, W, 3], base colour, linear RGB; 0 where no surface is seen."""
-        return self.image(self.attribute(self._renderer.twin.materials.base_color))
+        return self.image(self.material[:, :3])
+
+    @property
+    def material(self) -> np.ndarray:
+        """Base colour, roughness and metallic of the hits, float32 [N, 5]."""
+        return self._met.centres.material.numpy()
 
     def attribute(self, per_vertex: np.ndarray) -> np.ndarray:
         """A vertex attribute [V, ...] interpolated at the hits, [N, ...]."""
@@ -146,6 +152,12 @@ class Renderer:
         )
         return other
 
+    def brighter(self, gain: float) -> Renderer:
+        """The renderer of the same twin with so many times the light."""
+        other = copy(self)
+        other._exposure = self._exposure * np.float32(gain)
+        return other
+
     def through(self, camera: Camera) -> Renderer:
         """The renderer of the same twin through another camera."""
         if camera is self.camera:
@@ -156,12 +168,19 @@ class Renderer:
             vars(other).pop(name, None)
         return other
 
-    def view(self, T_world_camera: np.ndarray, mask: np.ndarray | None = None, exposure: float = 1.0) -> View:
+    def view(
+        self,
+        T_world_camera: np.ndarray,
+        mask: np.ndarray | None = None,
+        exposure: float = 1.0,
+        like: View | None = None,
+    ) -> View:
         """The view from ``T_world_camera`` [4, 4], of the pixels in ``mask`` [H, W] if given.
 
         Colours of pixels at silhouettes and shadow edges (and of those beside the mask's edge), and only
         those, are means over the pixel's area; labels are of its centre. ``exposure`` is a factor on the
-        radiance of this view.
+        radiance of this view. ``like`` is a view from there by a renderer of the same twin with other lobes,
+        through the same camera: what its rays met, and how that is lit, is not looked for again.
 
         Raises:
             TrajectoryError: that is no rigid pose. OptionError: the mask has another shape than the image.
@@ -171,24 +190,21 @@ class Renderer:
         if mask is not None and np.shape(mask) != shape:
             raise OptionError(f"the mask has the shape {np.shape(mask)}, but the image {shape}")
         light = self._illumination.at(T_world_camera)
-        hits, normals, radiance, facing, visible = self._cast(self.camera, light, T_world_camera, mask)
-        radiance = laid_out(radiance, hits.pixel, shape)
-        distance_mm = laid_out(hits.distance_mm, hits.pixel, shape)
-        told = laid_out(facing, hits.pixel, shape)
-        edges = discontinuities(distance_mm) | ((distance_mm > 0) & ~told)
-        if visible is not None:
-            edges |= shadow_edges(laid_out(visible, hits.pixel, shape))
-        edges &= self._sees if mask is None else mask
-        mean, count = self._mean_radiance(np.argwhere(edges)[:, ::-1], light, T_world_camera)
-        radiance[edges] = np.where(count[:, None] > 0, mean, radiance[edges])
-        told[edges] |= count > 0
-        told &= ~_alone(edges & (radiance.max(axis=2) == 0))
-        _close_slits(radiance, told, edges)
+        met = like._met if like else self._met(light, T_world_camera, mask)
+        radiance = laid_out(met.centres.radiance(light), met.centres.hits.pixel, shape)
+        mean, count = met.mean_radiance(light)
+        radiance[met.edges] = np.where(count[:, None] > 0, mean, radiance[met.edges])
+        told = met.told.copy()
+        told[met.edges] |= count > 0
+        dark = met.edges.copy()
+        dark[met.edges] = ~radiance[met.edges].any(axis=1)
+        told &= ~_alone(dark)
+        _close_slits(radiance, told, met.edges)
         radiance *= self._exposure * exposure
         if self._transmission is not None:
             radiance *= self._transmission
         color = shading.respond(torch.from_numpy(radiance), self.twin.response.gamma).clamp(0, 1).numpy()
-        return View(color, radiance, hits, shape, self, normals)
+        return View(color, radiance, met.centres.hits, shape, self, met)
 
     @property
     def nbytes(self) -> int:
@@ -209,19 +225,22 @@ class Renderer:
         """Bool [H, W]: pixels through which the lens sees at all."""
         return np.isfinite(self.camera.pixel_directions).all(axis=2)
 
-    def _mean_radiance(
-        self, uv: np.ndarray, light: ViewLight, T_world_camera: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Radiance float32 [N, 3], averaged over the rays in the area of pixels ``uv`` [N, 2] that meet a
-        surface which faces them, and how many do, [N]."""
+    def _met(self, light: ViewLight, T_world_camera: np.ndarray, mask: np.ndarray | None) -> _Met:
+        """What the rays of a view meet."""
+        shape = (self.camera.height, self.camera.width)
+        centres = self._cast(self.camera, light, T_world_camera, mask)
+        pixel = centres.hits.pixel
+        distance_mm = laid_out(centres.hits.distance_mm, pixel, shape)
+        told = laid_out(centres.facing, pixel, shape)
+        edges = discontinuities(distance_mm) | ((distance_mm > 0) & ~told)
+        if centres.visible is not None:
+            edges |= shadow_edges(laid_out(centres.visible, pixel, shape))
+        edges &= self._sees if mask is None else mask
         inside = (np.arange(SUBPIXELS) + 0.5) / SUBPIXELS - 0.5
         offsets = np.stack(np.meshgrid(inside, inside), axis=-1).reshape(-1, 2)
+        uv = np.argwhere(edges)[:, ::-1]
         rays = Rays(self.camera.directions(uv[:, None] + offsets).astype(np.float32))
-        hits, _, radiance, facing, _ = self._cast(rays, light, T_world_camera)
-        pixel = hits.pixel[facing]
-        total = laid_out(radiance[facing], pixel, (len(uv), len(offsets))).sum(axis=1)
-        count = np.bincount(pixel // len(offsets), minlength=len(uv)).astype(np.float32)
-        return total / np.maximum(count, 1)[:, None], count
+        return _Met(centres, told, edges, self._cast(rays, light, T_world_camera))
 
     def _cast(
         self,
@@ -229,17 +248,60 @@ class Renderer:
         light: ViewLight,
         T_world_camera: np.ndarray,
         mask: np.ndarray | None = None,
-    ) -> tuple[Correspondences, np.ndarray, np.ndarray, np.ndarray, np.ndarray | None]:
-        """Hits [N], their unit normals in the camera frame [N, 3], their radiance [N, 3], whether they face
-        their ray [N], and which light guides they see [N, K] (None where no shadow is cast)."""
+    ) -> _Points:
         hits = self.caster.cast(rays, T_world_camera, mask)
         mixed = hits.interpolate(self.twin.surface, self._normal_and_material)
         normals = to_camera(mixed[:, :3], T_world_camera)
-        radiance, visible = light.radiance(
-            hits, rays.pixel_directions, normals, torch.from_numpy(mixed[:, 3:])
-        )
         facing = -dot(normals, rays.pixel_directions.reshape(-1, 3).take(hits.pixel, axis=0)) > FACING
-        return hits, normals, radiance.numpy(), facing, visible
+        lit, visible = light.lit(hits, rays.pixel_directions, normals)
+        return _Points(hits, normals, torch.from_numpy(mixed[:, 3:]), facing, lit, visible)
+
+
+@dataclass(frozen=True, eq=False)
+class _Points:
+    """What rays meet, whatever lobes answer the light there.
+
+    Attributes:
+        hits: N of them. normals: float32 [N, 3], unit, in the camera frame. material: base colour, roughness
+            and metallic, [N, 5]. facing: bool [N], those that face their ray. lit: what the light guides do.
+        visible: which guides they see, [N, K]; None where no shadow is cast.
+    """
+
+    hits: Correspondences
+    normals: np.ndarray
+    material: torch.Tensor
+    facing: np.ndarray
+    lit: Lit
+    visible: np.ndarray | None
+
+    def radiance(self, light: ViewLight) -> np.ndarray:
+        """Float32 [N, 3]."""
+        return light.radiance(self.hits, self.lit, self.material).numpy()
+
+
+@dataclass(frozen=True, eq=False)
+class _Met:
+    """What the rays of a view meet.
+
+    Attributes:
+        centres: by the rays through the pixels' centres. told: bool [H, W], pixels whose centre shows its
+            colour. edges: bool [H, W], E pixels whose colour is a mean. within: by SUBPIXELS² rays in the
+            area of each of those.
+    """
+
+    centres: _Points
+    told: np.ndarray
+    edges: np.ndarray
+    within: _Points
+
+    def mean_radiance(self, light: ViewLight) -> tuple[np.ndarray, np.ndarray]:
+        """Radiance float32 [E, 3] of the edges, averaged over the rays that meet a surface which faces them,
+        and how many do, [E]."""
+        facing, edges, inside = self.within.facing, np.count_nonzero(self.edges), SUBPIXELS**2
+        pixel = self.within.hits.pixel[facing]
+        total = laid_out(self.within.radiance(light)[facing], pixel, (edges, inside)).sum(axis=1)
+        count = np.bincount(pixel // inside, minlength=edges).astype(np.float32)
+        return total / np.maximum(count, 1)[:, None], count
 
 
 def _normal_and_material(twin: Twin) -> np.ndarray:

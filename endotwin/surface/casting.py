@@ -5,16 +5,17 @@ from __future__ import annotations
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from copy import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 import torch
-from embreex import rtcore_scene
+from embreex import rtcore, rtcore_scene
 from embreex.mesh_construction import TriangleMesh
 from torch.nn.functional import embedding_bag
 
 from endotwin.cameras.base import Camera
 from endotwin.run.threads import THREADS
+from endotwin.surface.refit import Refit
 from endotwin.surface.surface import Surface
 
 RAYS_PER_TASK = 1 << 14
@@ -46,22 +47,28 @@ class Correspondences:
 
     def __getitem__(self, index: np.ndarray) -> Correspondences:
         rows = np.flatnonzero(index) if index.dtype == bool else index
-        return Correspondences(*(value.take(rows, axis=0) for value in vars(self).values()))
+        return Correspondences(*(getattr(self, each.name).take(rows, axis=0) for each in fields(self)))
 
     def interpolate(self, surface: Surface, per_vertex: np.ndarray) -> np.ndarray:
         """Barycentric interpolation of ``per_vertex`` [V, ...] at the hit points, [N, ...]."""
         values = np.ascontiguousarray(per_vertex, np.result_type(per_vertex, np.float32))
         table = torch.from_numpy(values).reshape(len(values), -1)
-        corners = torch.from_numpy(surface.triangles.take(self.triangle, axis=0))
         weights = torch.from_numpy(self.barycentric).to(table.dtype)
-        mixed = embedding_bag(corners, table, mode="sum", per_sample_weights=weights)
+        mixed = embedding_bag(self._corners(surface.triangles), table, mode="sum", per_sample_weights=weights)
         return mixed.numpy().reshape(len(self), *per_vertex.shape[1:])
+
+    def _corners(self, triangles: np.ndarray) -> torch.Tensor:
+        """Vertices of the triangles that are hit, [N, 3]; those of the latest ``triangles`` are kept."""
+        kept = vars(self).get("_kept")
+        if kept is None or kept[0] is not triangles:
+            kept = (triangles, torch.from_numpy(triangles.take(self.triangle, axis=0)))
+            vars(self)["_kept"] = kept
+        return kept[1]
 
 
 def surface_points(surface: Surface, hits: Correspondences) -> np.ndarray:
     """World points of hits, float64 [N, 3], mm."""
-    corners = surface.vertices_mm[surface.triangles[hits.triangle]].astype(np.float64)
-    return np.einsum("nk,nka->na", hits.barycentric.astype(np.float64), corners) + surface.origin_mm
+    return hits.interpolate(surface, surface.vertices_mm.astype(np.float64)) + surface.origin_mm
 
 
 class Caster:
@@ -70,13 +77,26 @@ class Caster:
     def __init__(self, surface: Surface, threads: int = THREADS):
         self.surface = surface
         self._threads = threads
-        self._scene = rtcore_scene.EmbreeScene(robust=True)
+        self._device = rtcore.EmbreeDevice()
+        self._scene = rtcore_scene.EmbreeScene(self._device, robust=True)
         self._mesh = TriangleMesh(self._scene, surface.vertices_mm, surface.triangles)
+        self._refit: Refit | None = None
 
     def threaded(self, threads: int) -> Caster:
         """The same scene, cast into by so many threads."""
         other = copy(self)
         other._threads = threads
+        return other
+
+    def moved(self, surface: Surface) -> Caster:
+        """A caster of ``surface``, which has the same triangles; it takes the place of this one, which is
+        not to be used any more."""
+        self._refit = self._refit or Refit.of(self._scene, self._device, len(surface.vertices_mm))
+        if self._refit is None:
+            return Caster(surface, self._threads)
+        self._refit.move(surface.vertices_mm)
+        other = copy(self)
+        other.surface = surface
         return other
 
     def cast_rays(

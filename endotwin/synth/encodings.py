@@ -22,20 +22,17 @@ HALF_MAX = 65504.0
 
 # Measured on VGA frames of a fitted twin, one core:
 # PNG level 1, run lengths, filter of averages: 8 ms and 216 kB; with all filters tried: 14 ms and 207 kB.
-# Depth: Deflate of differences 15 ms, 187 kB; plain Deflate 11 ms, 487 kB; uncompressed 1 ms, 615 kB.
-# Normals: Deflate of differences 60 ms, 1.25 MB; plain Deflate 25 ms, 1.72 MB; uncompressed 1 ms, 1.84 MB.
-# LZW is no smaller, and tifffile cannot read it without further packages.
-# EXR: ZIP 15 ms, 661 kB for RGB as half floats, and 12 ms, 1.09 MB for depth as floats; PIZ 12 ms, 689 kB and
-# 40 ms, 976 kB. Zstandard is smaller for floats, but only OpenEXR 3.5 and newer read it.
+# TIFF of differences by tifffile, Deflate at level 1: depth 6 ms, 203 kB, flow 12 ms, 345 kB; by OpenCV,
+# which knows no levels, 17 ms, 203 kB and 45 ms, 289 kB. LZW is larger, and tifffile cannot read it without
+# further packages. Normals: Deflate of differences 60 ms, 1.25 MB; uncompressed 1 ms, 1.84 MB.
+# EXR: RGB as half floats with ZIP 19 ms, 848 kB; uncompressed 7 ms, 1.85 MB. Floats: ZIP takes 7 times as
+# long as no compression for an eighth less (scene flow 50 ms, 3.22 MB; 5 ms, 3.69 MB), and so does Deflate in
+# NPZ (vertices 148 ms, 3.29 MB; 2 ms, 3.69 MB).
 PNG = (
     *(cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE),
     *(cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_AVG),
 )
-SMOOTH_TIFF = (
-    *(cv2.IMWRITE_TIFF_COMPRESSION, cv2.IMWRITE_TIFF_COMPRESSION_ADOBE_DEFLATE),
-    *(cv2.IMWRITE_TIFF_PREDICTOR, cv2.IMWRITE_TIFF_PREDICTOR_HORIZONTAL),
-)
-PLAIN_TIFF = (cv2.IMWRITE_TIFF_COMPRESSION, cv2.IMWRITE_TIFF_COMPRESSION_NONE)
+DEFLATE = {"compression": "adobe_deflate", "predictor": True, "compressionargs": {"level": 1}}
 
 
 @dataclass(frozen=True)
@@ -82,10 +79,12 @@ def encode_normals(normals: np.ndarray) -> np.ndarray:
 
 def encode_flow(flow_px: np.ndarray) -> np.ndarray:
     """Flow [H, W, 2], NaN where there is none, as C3VD's uint16 [H, W, 3]: ±20 px, 0 none or beyond."""
-    inside = (np.abs(flow_px) <= FLOW_RANGE_PX).all(axis=-1, keepdims=True)
-    raw = np.rint((np.where(inside, flow_px, 0) + FLOW_RANGE_PX) * (UINT16 / 2 / FLOW_RANGE_PX))
-    coded = np.zeros((*flow_px.shape[:2], 3), np.uint16)
-    coded[..., :2] = np.where(inside, np.maximum(raw, 1), 0)
+    x, y = plane(flow_px, 0), plane(flow_px, 1)
+    inside = (np.abs(x) <= FLOW_RANGE_PX) & (np.abs(y) <= FLOW_RANGE_PX)
+    coded = np.zeros((*inside.shape, 3), np.uint16)
+    for channel, values in enumerate((x, y)):
+        raw = np.rint((np.where(inside, values, 0) + FLOW_RANGE_PX) * np.float32(UINT16 / 2 / FLOW_RANGE_PX))
+        coded[..., channel] = np.where(inside, np.maximum(raw, 1), 0)
     return coded
 
 
@@ -99,9 +98,12 @@ def png(image: np.ndarray) -> bytes:
     return cv2.imencode(".png", rgb_order(image), PNG)[1].tobytes()
 
 
-def tiff(image: np.ndarray, options: tuple[int, ...]) -> bytes:
-    """A TIFF file of an image uint16, [H, W] or RGB [H, W, 3]."""
-    return cv2.imencode(".tiff", rgb_order(image), options)[1].tobytes()
+def tiff(image: np.ndarray, **compression) -> bytes:
+    """A TIFF file of an image uint16 or int32, [H, W] or RGB [H, W, 3]."""
+    file = BytesIO()
+    kind = "rgb" if image.ndim == 3 else "minisblack"
+    tifffile.imwrite(file, image, photometric=kind, metadata=None, **compression)
+    return file.getvalue()
 
 
 def pixels(content: bytes) -> np.ndarray:
@@ -134,16 +136,11 @@ def decode_flow(content: bytes) -> np.ndarray:
     return np.where((raw == 0).all(axis=-1, keepdims=True), np.nan, flow_px)
 
 
-def ids(image: np.ndarray) -> bytes:
-    """A TIFF file of int32 [H, W]."""
-    file = BytesIO()
-    tifffile.imwrite(file, image, compression="adobe_deflate", compressionargs={"level": 1}, metadata=None)
-    return file.getvalue()
-
-
 def exr(**channels: np.ndarray) -> bytes:
     """An OpenEXR file of float16 or float32 channels, [H, W] or, as ``RGB``, [H, W, 3]."""
-    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    halves = all(values.dtype == np.float16 for values in channels.values())
+    compression = OpenEXR.ZIP_COMPRESSION if halves else OpenEXR.NO_COMPRESSION
+    header = {"compression": compression, "type": OpenEXR.scanlineimage}
     file = BytesIO()
     OpenEXR.File(header, channels, num_threads=0).write(file)
     return file.getvalue()
@@ -160,9 +157,9 @@ def channels(content: bytes, *names: str) -> np.ndarray:
 
 
 def npz(**arrays: np.ndarray) -> bytes:
-    """A compressed NPZ file of arrays by name; the same bytes at any time."""
+    """An NPZ file of arrays by name; the same bytes at any time."""
     file = BytesIO()
-    np.savez_compressed(file, **arrays)
+    np.savez(file, **arrays)
     return file.getvalue()
 
 
@@ -233,7 +230,7 @@ ENCODINGS: dict[str, Encoding] = {
     ),
     "depth": Encoding(
         ".tiff",
-        lambda depth_mm: tiff(encode_depth(depth_mm), SMOOTH_TIFF),
+        lambda depth_mm: tiff(encode_depth(depth_mm), **DEFLATE),
         "16-bit z-depth, raw / 65535 * 100 mm; 0: none; 65535: 100 mm up (clipped)",
         decode_depth,
         DEPTH_RANGE_MM / UINT16,
@@ -246,7 +243,7 @@ ENCODINGS: dict[str, Encoding] = {
     ),
     "normals": Encoding(
         ".tiff",
-        lambda normals: tiff(encode_normals(normals), PLAIN_TIFF),
+        lambda normals: tiff(encode_normals(normals)),
         "16-bit RGB, raw / 65535 * 2 - 1 = x, y, z of the unit normal that points into the lumen, in camera "
         "axes; 0, 0, 0: none",
         decode_normals,
@@ -291,7 +288,7 @@ ENCODINGS: dict[str, Encoding] = {
     ),
     "flow": Encoding(
         ".tiff",
-        lambda flow_px: tiff(encode_flow(flow_px), SMOOTH_TIFF),
+        lambda flow_px: tiff(encode_flow(flow_px), **DEFLATE),
         "16-bit, " + _FLOW.format(way=_BACK),
         decode_flow,
         FLOW_STEP_PX,
@@ -299,7 +296,7 @@ ENCODINGS: dict[str, Encoding] = {
     "flow_hidden": Encoding(".png", png, _HIDDEN.format(other="previous"), pixels),
     "flow_forward": Encoding(
         ".tiff",
-        lambda flow_px: tiff(encode_flow(flow_px), SMOOTH_TIFF),
+        lambda flow_px: tiff(encode_flow(flow_px), **DEFLATE),
         "16-bit, " + _FLOW.format(way=_ON),
         decode_flow,
         FLOW_STEP_PX,
@@ -336,9 +333,15 @@ ENCODINGS: dict[str, Encoding] = {
         "materials are a guess); 64: filled in (its shape is a guess too); 0: no surface",
         pixels,
     ),
+    "overlay": Encoding(
+        ".png",
+        png,
+        "8-bit: 255: the processor's overlay hides what the photo would show here; 0: it does not",
+        pixels,
+    ),
     "triangles": Encoding(
         ".tiff",
-        ids,
+        lambda triangle: tiff(triangle, **DEFLATE),
         "32-bit signed: index of the triangle in surface.ply, counted from 0; -1: none",
         lambda content: tifffile.imread(BytesIO(content)),
     ),

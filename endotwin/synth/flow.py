@@ -6,6 +6,7 @@ import numpy as np
 
 from endotwin.cameras import Camera
 from endotwin.surface.casting import Caster, Correspondences
+from endotwin.surface.vectors import dot, unit
 
 HIDDEN_MM = 1e-3
 HIDDEN = 1e-4
@@ -17,22 +18,28 @@ BEHIND_MM = 0.01
 OCCLUSION_RANGE_MM = 100.0
 
 
-def flow_to(points: np.ndarray, pixel: np.ndarray, camera: Camera, T_world_other: np.ndarray) -> np.ndarray:
-    """Motion float64 [N, 2], px, of pixels int [N] to where their points [N, 3] lie in the view from another
-    pose [4, 4]; NaN where the lens does not see in that direction."""
-    uv = np.stack([pixel % camera.width, pixel // camera.width], axis=1)
-    return camera.project(to_camera_frame(points, T_world_other)) - uv
+def projected(points: np.ndarray, camera: Camera, T_world_camera: np.ndarray) -> np.ndarray:
+    """Where points [N, 3] lie in the view from a pose [4, 4], px, float64 [N, 2]; NaN where the lens does not
+    see in that direction."""
+    return camera.project(to_camera_frame(points, T_world_camera))
 
 
-def seen_from(points: np.ndarray, caster: Caster, camera: Camera, T_world_other: np.ndarray) -> np.ndarray:
-    """Bool [N]: points [N, 3] on the surface that the view from ``T_world_other`` [4, 4] shows."""
-    uv = camera.project(to_camera_frame(points, T_world_other))
-    inside = np.isfinite(uv).all(axis=1)
-    inside &= ((uv > -0.5) & (uv < (camera.width - 0.5, camera.height - 0.5))).all(axis=1)
+def flow_to(uv: np.ndarray, pixel: np.ndarray, camera: Camera) -> np.ndarray:
+    """Motion float64 [N, 2], px, of pixels int [N] to places ``uv`` [N, 2] in another view."""
+    return uv - np.stack([pixel % camera.width, pixel // camera.width], axis=1)
+
+
+def seen_from(
+    points: np.ndarray, uv: np.ndarray, caster: Caster, camera: Camera, T_world_other: np.ndarray
+) -> np.ndarray:
+    """Bool [N]: points [N, 3] on the surface, at ``uv`` [N, 2] in the view from ``T_world_other`` [4, 4],
+    that it shows."""
+    u, v = uv.T
+    inside = (u > -0.5) & (u < camera.width - 0.5) & (v > -0.5) & (v < camera.height - 0.5)
     chosen = np.flatnonzero(inside)
     origin = T_world_other[:3, 3]
-    towards = points[chosen] - origin
-    distance_mm = np.linalg.norm(towards, axis=1)
+    towards = points.take(chosen, axis=0) - origin
+    distance_mm = np.sqrt(dot(towards, towards))
     local = (origin - caster.surface.origin_mm).astype(np.float32)
     rays = (towards / np.maximum(distance_mm, 1e-9)[:, None]).astype(np.float32)
     length_mm = distance_mm * (1 - HIDDEN) - HIDDEN_MM
@@ -47,7 +54,7 @@ def hides_surface(
     """Bool [N]: points [N, 3] of ``hits`` with more surface behind them on the same ray, within
     OCCLUSION_RANGE_MM of the camera (C3VD's occlusion)."""
     towards = points - T_world_camera[:3, 3]
-    rays = (towards / np.linalg.norm(towards, axis=1, keepdims=True)).astype(np.float32)
+    rays = unit(towards).astype(np.float32)
     behind = (points - caster.surface.origin_mm).astype(np.float32) + BEHIND_MM * rays
     left_mm = OCCLUSION_RANGE_MM - hits.distance_mm - BEHIND_MM
     return ~caster.unobstructed(behind, rays, left_mm)

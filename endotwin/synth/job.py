@@ -29,8 +29,10 @@ class Job:
         twin: fitted, before any edit. camera: of the frames.
         trajectory: a pose a frame. draws: edits of the twin, one a frame. regions: that the draws refer to.
         labels: names of labels. images: names of the images that they are written as. layout: its name.
-        shard_frames: frames that are rendered, and counted as done, together.
+        shard_frames: frames that are rendered, and counted as done, together: a clip, where they are
+            recorded as a video.
         document: the content of ``dataset.json``. motion: of the tissue; None: it is still.
+        gains: float [N], on the light of each frame, where the camera sets them itself; None: 1.
     """
 
     twin: Twin
@@ -44,6 +46,7 @@ class Job:
     shard_frames: int
     document: dict
     motion: Motion | None = None
+    gains: np.ndarray | None = None
 
     def __len__(self) -> int:
         return len(self.trajectory)
@@ -91,6 +94,6 @@ def fingerprint(twin: Twin) -> str:
     return digest.hexdigest()
 
 
-def versions() -> dict[str, str]:
-    """Of the libraries that decide the bytes."""
-    return {library: version(library) for library in LIBRARIES}
+def versions(recorder: bool) -> dict[str, str]:
+    """Of the libraries that decide the bytes, and of the video's ``recorder``."""
+    return {library: version(library) for library in LIBRARIES + (("av",) if recorder else ())}

@@ -8,6 +8,7 @@ from functools import cached_property
 import numpy as np
 
 from endotwin.effects.exposure import following
+from endotwin.effects.video import Clip
 from endotwin.errors import OptionError
 from endotwin.light.incidence import to_camera
 from endotwin.render import Renderer, View
@@ -15,7 +16,7 @@ from endotwin.render.renderer import laid_out
 from endotwin.run.streams import Stream
 from endotwin.surface import Surface
 from endotwin.surface.casting import Correspondences, surface_points
-from endotwin.synth.flow import flow_to, hides_surface, seen_from
+from endotwin.synth.flow import flow_to, hides_surface, projected, seen_from
 from endotwin.synth.job import Job
 from endotwin.synth.motion import Body
 from endotwin.synth.photograph import photographed
@@ -44,6 +45,7 @@ LABELS: dict[str, tuple[str, ...]] = {
     "flow_forward_npz": ("flow_forward_npz", "flow_forward_hidden"),
     "occlusion": ("occlusion",),
     "triangles": ("triangles",),
+    "overlay": ("overlay",),
     "scene_flow": ("scene_flow",),
     "scene_flow_forward": ("scene_flow_forward",),
     "vertices": ("vertices",),
@@ -58,12 +60,15 @@ DEFAULT_LABELS = ("rgb", "depth", "normals", "mask")
 MIRRORS = ("coat", "film")
 """Effects that reflect without scattering."""
 
+COLUMNS = {"base_color": slice(0, 3), "roughness": 3, "metallic": 4}
+"""Of a view's material."""
+
 HIGHLIGHT = 0.1
 """Display values by which specular reflection brightens a pixel of a highlight, in its darkest channel."""
 
 PHOTOS = {"rgb", "rgb_linear", "rgb_exr"}
 SPLIT = {"diffuse", "specular"}
-SHADED = PHOTOS | SPLIT | {"albedo", "roughness", "metallic"}
+SHADED = PHOTOS | SPLIT | {"albedo", "roughness", "metallic", "overlay"}
 """Labels that need a photo, those of its parts, and all that need the frame's draw."""
 
 
@@ -102,28 +107,30 @@ class Labeller:
         self._T_world_next = following(job.trajectory.T_world_camera)
         self._shaded: tuple[object, Renderer, Renderer | None] | None = None
 
-    def frame(self, index: int) -> dict[str, np.ndarray]:
-        """The images of frame ``index`` by name, as ``LABELS`` has them."""
+    def frame(self, index: int, clip: Clip | None = None) -> dict[str, np.ndarray]:
+        """The images of frame ``index`` by name, as ``LABELS`` has them; ``clip``: that its photo is the next
+        picture of."""
         job = self._job
         T_world_camera = job.trajectory.T_world_camera[index]
         images, view = {}, None
         renderer = specular_free = None
         if SHADED & set(job.labels):
-            renderer, specular_free = self._renderers(index)
-        if PHOTOS & set(job.labels):
+            renderer, specular_free = self.renderers(index)
+        if (PHOTOS | {"specular"}) & set(job.labels):
             view = renderer.view(T_world_camera)
+        if PHOTOS & set(job.labels):
             generator = Stream.SENSOR.generator(job.document["seed"], index)
             color, radiance = photographed(
-                renderer, view, T_world_camera, self._T_world_next[index], generator
+                renderer, view, T_world_camera, self._T_world_next[index], generator, clip
             )
             images = {"rgb": color, "rgb_linear": radiance, "rgb_exr": radiance}
         if specular_free is not None:
-            matt = specular_free.view(T_world_camera)
+            matt = specular_free.view(T_world_camera, like=view)
             images["diffuse"] = matt.color
             if "specular" in job.labels:
-                view = view or renderer.view(T_world_camera)
                 images["specular"] = view.color - matt.color
-                images["highlights"] = np.uint8(255 * (images["specular"].min(axis=2) > HIGHLIGHT))
+                red, green, blue = np.moveaxis(images["specular"] > HIGHLIGHT, 2, 0)
+                images["highlights"] = np.uint8(255) * (red & green & blue)
             view = view or matt
         hits = view.hits if view else self._body.at(index).cast(job.camera, T_world_camera)
         geometry = _Geometry(job, self._body, hits, index, self._kinds, renderer, view)
@@ -132,7 +139,7 @@ class Labeller:
                 images[name] = getattr(geometry, name)
         return {name: images[name] for name in job.images}
 
-    def _renderers(self, index: int) -> tuple[Renderer, Renderer | None]:
+    def renderers(self, index: int) -> tuple[Renderer, Renderer | None]:
         """The renderer of the frame's draw, and the one without specular reflection if that is asked for."""
         draw = self._job.draws[index]
         kept = self._shaded
@@ -148,10 +155,13 @@ class Labeller:
                 matt = replace(twin, materials=matt, effects=twin.effects.without(MIRRORS))
                 specular_free = renderer.edited(matt, exposure)
             kept = self._shaded = (draw, renderer, specular_free)
-        if not self._body.moves:
-            return kept[1:]
-        caster = self._body.at(index)
-        return tuple(None if renderer is None else renderer.moved(caster) for renderer in kept[1:])
+        renderers = kept[1:]
+        if self._body.moves:
+            caster = self._body.at(index)
+            renderers = tuple(renderer and renderer.moved(caster) for renderer in renderers)
+        if self._job.gains is None:
+            return renderers
+        return tuple(renderer and renderer.brighter(self._job.gains[index]) for renderer in renderers)
 
 
 class _Geometry:
@@ -170,6 +180,7 @@ class _Geometry:
         self._job, self._body, self._hits, self._index = job, body, hits, index
         self._caster = body.at(index)
         self._others: dict[int, np.ndarray] = {}
+        self._places: dict[int, np.ndarray] = {}
         self._kinds, self._renderer, self._view = kinds, renderer, view
         self._T_world_camera = job.trajectory.T_world_camera[index]
 
@@ -178,6 +189,8 @@ class _Geometry:
         return laid_out(values, self._hits.pixel, shape, empty)
 
     def _material(self, name: str) -> np.ndarray:
+        if self._view:
+            return self._image(self._view.material[:, COLUMNS[name]])
         return self._image(
             self._hits.interpolate(self._job.twin.surface, getattr(self._renderer.twin.materials, name))
         )
@@ -217,6 +230,13 @@ class _Geometry:
     @property
     def triangles(self) -> np.ndarray:
         return self._image(self._hits.triangle, -1)
+
+    @property
+    def overlay(self) -> np.ndarray:
+        height, width = self._job.camera.height, self._job.camera.width
+        effect = self._renderer.twin.effects.get("overlay")
+        hidden = np.zeros((height, width), bool) if effect is None else effect.hides(height, width)
+        return np.where(hidden, np.uint8(255), np.uint8(0))
 
     @property
     def occlusion(self) -> np.ndarray:
@@ -270,25 +290,32 @@ class _Geometry:
 
     def _scene_flow(self, index: int) -> np.ndarray:
         if self._other(index) is None:
-            return self._image(np.full((len(self._hits), 3), np.nan), np.nan)
-        return self._image(self._points_at(index) - self._points, np.nan)
+            return self._image(np.full((len(self._hits), 3), np.nan, np.float32), np.nan)
+        return self._image((self._points_at(index) - self._points).astype(np.float32), np.nan)
 
     def _other(self, index: int) -> np.ndarray | None:
         """The pose of another frame; None where there is none."""
         poses = self._job.trajectory.T_world_camera
         return poses[index] if 0 <= index < len(poses) else None
 
+    def _uv_at(self, index: int) -> np.ndarray:
+        """Where the points of the hits lie in another frame's image, px, float64 [N, 2]."""
+        if index not in self._places:
+            points = self._points_at(index)
+            self._places[index] = projected(points, self._job.camera, self._other(index))
+        return self._places[index]
+
     def _flow(self, index: int) -> np.ndarray:
-        T_world_other = self._other(index)
-        if T_world_other is None:
-            return self._image(np.full((len(self._hits), 2), np.nan), np.nan)
-        points = self._points_at(index)
-        return self._image(flow_to(points, self._hits.pixel, self._job.camera, T_world_other), np.nan)
+        if self._other(index) is None:
+            return self._image(np.full((len(self._hits), 2), np.nan, np.float32), np.nan)
+        flow_px = flow_to(self._uv_at(index), self._hits.pixel, self._job.camera)
+        return self._image(flow_px.astype(np.float32), np.nan)
 
     def _hidden(self, index: int) -> np.ndarray:
         T_world_other = self._other(index)
         if T_world_other is None:
             return self._image(np.full(len(self._hits), HIDDEN_NONE, np.uint8), HIDDEN_NONE)
         there = self._body.at(index)
-        seen = seen_from(self._points_at(index), there, self._job.camera, T_world_other)
+        points, uv = self._points_at(index), self._uv_at(index)
+        seen = seen_from(points, uv, there, self._job.camera, T_world_other)
         return self._image(np.where(seen, np.uint8(HIDDEN_NO), np.uint8(HIDDEN_YES)), HIDDEN_NONE)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
@@ -135,7 +136,8 @@ def rendered_ms(twin: Twin) -> dict[str, float]:
     for name in RENDERED:
         renderer = Renderer(equipped(twin, {name: "on"}, trajectory=""), caster=caster)
         view = renderer.view(poses[middle])
-        costs[name] = round(best_ms(partial(photographed, renderer, view, *moving)), 1)
+        with suppress(OptionError):  # without a recorder there is nothing to pay
+            costs[name] = round(best_ms(partial(photographed, renderer, view, *moving)), 1)
     return costs
 
 

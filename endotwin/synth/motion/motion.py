@@ -6,6 +6,7 @@ import logging
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
+from threading import local
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -37,6 +38,9 @@ FLAWS, MORE = 1e-4, 1.1
 """Share of the vertices that may be folded, and of the triangles that may cross others, beside MORE of those
 that do at rest: a fused mesh has slivers, and layers that nearly touch."""
 
+PART = 1 << 14
+"""Vertices that are moved at once: what is made on the way stays in the cache, in a third of the time."""
+
 KEPT = 3
 """Surfaces that are kept: of a frame and its neighbours."""
 
@@ -65,9 +69,14 @@ class Motion:
     def surface(self, time_s: float) -> Surface:
         """The surface at ``time_s``: vertices and normals of the one at rest as they are then."""
         shift, M = self._bent(time_s)
-        normals, _ = turned(self.rest.normals, self.places, self.line, shift, M)
-        vertices_mm = moved(self.rest.vertices_mm, self.places, shift, M)
-        return replace(self.rest, vertices_mm=vertices_mm, normals=normals.astype(np.float32))
+        rest = self.rest
+        vertices_mm, normals = np.empty_like(rest.vertices_mm), np.empty_like(rest.normals)
+        for start in range(0, len(vertices_mm), PART):
+            part = slice(start, start + PART)
+            places = self.places[part]
+            vertices_mm[part] = moved(rest.vertices_mm[part], places, shift, M)
+            normals[part] = turned(rest.normals[part], places, self.line, shift, M)[0]
+        return replace(rest, vertices_mm=vertices_mm, normals=normals)
 
     def carried(self, trajectory: Trajectory) -> Trajectory:
         """The trajectory on which the moving lumen takes the camera along, without the poses that its wall
@@ -166,7 +175,7 @@ class Body:
     def __init__(self, rest: Surface, motion: Motion | None, times_s: np.ndarray):
         self._motion, self._times_s = motion, times_s
         self._still = Caster(rest, threads=1)
-        self._casters: dict[float, Caster] = {}
+        self._kept = local()  # a thread's own: another's rays are under way in its casters
 
     @property
     def moves(self) -> bool:
@@ -183,11 +192,18 @@ class Body:
         if self._motion is None:
             return self._still
         time_s = float(self._times_s[index])
-        caster = self._casters.pop(time_s, None) or Caster(self._motion.surface(time_s), threads=1)
-        self._casters[time_s] = caster
-        if len(self._casters) > KEPT:
-            del self._casters[next(iter(self._casters))]  # the one that was used longest ago
+        casters = vars(self._kept).setdefault("casters", {})
+        caster = casters.pop(time_s, None)
+        if caster is None:
+            caster = self._unused(casters).moved(self._motion.surface(time_s))
+        casters[time_s] = caster
         return caster
+
+    def _unused(self, casters: dict[float, Caster]) -> Caster:
+        """A caster whose place another may take: a new one, or that of the frame asked for longest ago."""
+        if len(casters) < KEPT:
+            return Caster(self._still.surface, threads=1)
+        return casters.pop(next(iter(casters)))
 
 
 def parse_motion(specs: Iterable[str] | str, twin: Twin) -> Motion | None:

@@ -52,7 +52,7 @@ def _there(frame: Frame) -> np.ndarray | None:
     for name, of in says.items():
         if frame.written.has(name):
             return of(frame.image(name))
-    return None if frame.distance_mm is None else np.isfinite(frame.first(*DEPTHS))
+    return None if frame.distance_mm is None else ~np.isnan(frame.first(*DEPTHS))
 
 
 def _places(frame: Frame) -> Iterator[Judged]:

@@ -13,6 +13,7 @@ import numpy as np
 import trimesh
 
 from endotwin.cameras import Camera
+from endotwin.effects.video import CLIP_FRAMES, Video
 from endotwin.errors import EndotwinError, OptionError, OutputError, TwinError
 from endotwin.run.output import DATASET, check_apart, unwritable
 from endotwin.run.threads import cores
@@ -20,6 +21,7 @@ from endotwin.synth.encodings import FLOW_RANGE_PX
 from endotwin.synth.job import Job
 from endotwin.synth.labels import DEFAULT_LABELS, LABELS, OF_MOTION
 from endotwin.synth.layouts import LAYOUTS
+from endotwin.synth.metering import metered
 from endotwin.synth.motion import Motion
 from endotwin.synth.proof import Proof, Written, prove
 from endotwin.synth.proof.written import read_records
@@ -147,19 +149,25 @@ def make_job(
     refusal = LAYOUTS[layout].refusal(camera, labels)
     if refusal:
         raise OptionError(f"layout {layout}: {refusal}")
-    return Job(
+    draws = variation.draw(len(trajectory), seed)
+    used = {*twin.effects, *(name for draw in draws for name, on in draw.effects if on)}
+    filmed = "video" in used
+    if filmed:
+        Video.require_encoder()
+    job = Job(
         twin=twin,
         camera=camera,
         trajectory=trajectory,
-        draws=variation.draw(len(trajectory), seed),
+        draws=draws,
         regions=variation.regions,
         labels=labels,
         images=tuple(dict.fromkeys(image for label in labels for image in LABELS[label])),
         layout=layout,
-        shard_frames=LAYOUTS[layout].shard_frames,
-        document=describe(twin, trajectory, seed, labels, layout, camera, variation, motion),
+        shard_frames=max(LAYOUTS[layout].shard_frames, CLIP_FRAMES if filmed else 0),
+        document=describe(twin, trajectory, seed, labels, layout, camera, variation, motion, filmed),
         motion=motion,
     )
+    return metered(job) if "auto_gain" in used else job
 
 
 def _render(

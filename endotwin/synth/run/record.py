@@ -26,7 +26,7 @@ LICENSE_NOTE = (
 COMMON_WORDS = {
     "frames": "frames.jsonl: a JSON object a frame: index, pose (its number in the trajectory that was "
     "asked for), timestamp_s, T_world_camera (4x4, row by row, mm, OpenCV "
-    "axes), checks of the pose, and the edits that were drawn for it",
+    "axes), checks of the pose, the automatic gain if there is one, and the edits that were drawn for it",
     "document": "dataset.json: this; datasheet.html: pictures and histograms",
 }
 
@@ -40,8 +40,12 @@ def describe(
     camera: Camera,
     variation: Variation,
     motion: Motion | None = None,
+    recorder: bool = False,
 ) -> dict:
-    """All of ``dataset.json`` that is known before the first frame is rendered."""
+    """All of ``dataset.json`` that is known before the first frame is rendered.
+
+    ``recorder``: whether frames are recorded as a video.
+    """
     chosen = LAYOUTS[layout]
     moving = {} if motion is None else {"motion": motion.to_dict()}
     words = {image: chosen.encoding(image).words for label in labels for image in LABELS[label]}
@@ -72,7 +76,7 @@ def describe(
             "response": asdict(twin.response),
             "effects": twin.effects.to_dict(),
         },
-        "versions": versions(),
+        "versions": versions(recorder),
         "conventions": {**words, **chosen.words, **COMMON_WORDS},
         "license_note": LICENSE_NOTE,
     }

@@ -8,6 +8,7 @@ import tarfile
 from io import BytesIO
 from pathlib import Path
 
+from endotwin.effects.video import Clip
 from endotwin.synth.job import Job
 from endotwin.synth.labels import Labeller
 from endotwin.synth.layouts import LAYOUTS
@@ -26,6 +27,8 @@ def frame_record(job: Job, index: int) -> dict:
         "T_world_camera": trajectory.T_world_camera[index].tolist(),
         "checks": {name: round(float(values[index]), 4) for name, values in trajectory.checks.items()},
     }
+    if job.gains is not None:
+        record["gain"] = float(job.gains[index])
     return {**record, **job.draws[index].to_dict(job.regions)}
 
 
@@ -36,12 +39,12 @@ def render_shard(job: Job, labeller: Labeller, folder: Path, number: int) -> Non
         folder: of the unfinished dataset: files go to its ``data``, the mark to its ``done``.
     """
     layout = LAYOUTS[job.layout]
-    statistics = Statistics()
+    statistics, clip = Statistics(), Clip()
     tar = None
     if layout.packed:
         tar = _Tar(folder / DATA / f"shard-{number:04d}.tar")
     for index in job.shard(number):
-        images = labeller.frame(index)
+        images = labeller.frame(index, clip)
         statistics.add(images, thumbnail_of=index if index in job.thumbnails else None)
         for name, image in images.items():
             content, place = layout.encoding(name).encode(image), layout.file(job, index, name)

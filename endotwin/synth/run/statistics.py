@@ -58,8 +58,8 @@ class Statistics:
                 self.coverage[kind].append(float(counts[value] / images["mask"].size))
         for name in ("flow", "flow_forward"):
             if name in images:
-                flows = np.isfinite(images[name]).all(axis=-1)
-                lost = flows & (np.abs(images[name]) > FLOW_RANGE_PX).any(axis=-1)
+                most_px = np.maximum(*np.moveaxis(np.abs(images[name]), -1, 0))
+                flows, lost = np.isfinite(most_px), most_px > FLOW_RANGE_PX
                 self._add_flow(name, [int(flows.sum()), int(lost.sum())])
         if thumbnail_of is not None:
             self.thumbnails[thumbnail_of] = b64encode(thumbnail(images)).decode()

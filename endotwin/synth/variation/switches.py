@@ -16,7 +16,7 @@ from endotwin.sequence.readers import open_sequence
 from endotwin.synth.variation.edits import OFFSETS, Edit
 from endotwin.twin import Twin
 
-NEED_VELOCITY = ("motion_blur", "rolling_shutter")
+SUCCESSIVE = ("motion_blur", "rolling_shutter", "interlacing", "auto_gain")
 
 
 def parameter_names() -> tuple[str, ...]:
@@ -62,7 +62,7 @@ def equipped(twin: Twin, states: Mapping[str, str], trajectory: object) -> Twin:
             continue
         if name in FITTED and name != "coat":
             raise OptionError(f"the twin has no {name}; a fit with its effect {name} on finds it")
-        if name in NEED_VELOCITY and str(trajectory).startswith("jitter"):
+        if name in SUCCESSIVE and str(trajectory).startswith("jitter"):
             raise OptionError(f"{name} needs poses that follow each other, and those of jitter do not")
         found = effect_class(name).evidence(sequence or twin.sequence())[0] if name in RENDERED else None
         effects = effects.including(found or effect_class(name)())
