@@ -15,18 +15,8 @@ from endotwin.errors import OptionError
 
 FITTED = ("specular", "offset", "shadows", "interreflection", "gain", "vignetting", "profile", "coat", "film")
 RENDERED = (
-    *(
-        "auto_gain",
-        "noise",
-        "motion_blur",
-        "defocus",
-        "rolling_shutter",
-        "interlacing",
-        "chromatic",
-        "bloom",
-        "lens",
-    ),
-    *("processor", "overlay", "codec", "video"),
+    *("auto_gain", "noise", "motion_blur", "defocus", "rolling_shutter", "interlacing", "chromatic"),
+    *("bloom", "lens", "processor", "overlay", "codec", "video"),
 )
 NAMES = (*FITTED, *RENDERED)
 
