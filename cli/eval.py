@@ -36,6 +36,13 @@ def evaluate(
             help="Score another method's pictures of the held-out frames, each named as its photo.",
         ),
     ] = None,
+    halves: Annotated[
+        bool,
+        typer.Option(
+            "--halves",
+            help="Also score each half of a photo at a pose that was fitted to its other half.",
+        ),
+    ] = False,
     json: Annotated[
         bool, typer.Option("--json", help="Print the scores as JSON instead of a table.")
     ] = False,
@@ -79,7 +86,7 @@ def evaluate(
             other = None if sequence is None else open_sequence(sequence, scale=scale or 1.0)
         with run.stage("eval"):
             scored = twin if twin is None or scale is None else twin.at_scale(scale)
-            evaluation = evaluate(scored, sheet, run.progress, overwrite, other, renders)
+            evaluation = evaluate(scored, sheet, run.progress, overwrite, other, renders, halves)
         print(json_format.dumps(evaluation.to_dict()) if json else evaluation)
         with run.stage("write"):
             own = sequence is None and renders is None

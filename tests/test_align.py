@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import tube_sequence
 from command_line import invoke
+from scipy.spatial.transform import Rotation, Slerp
 
 import endotwin
 from endotwin.align.corrections import SHARED, Corrections
@@ -62,6 +63,19 @@ def test_a_lag_of_a_whole_frame_is_the_next_pose():
     T = tube_sequence.poses(6)
     later = replace(Corrections.none(T), shared=np.r_[np.zeros(12), 1.0]).poses
     np.testing.assert_allclose(later[:-1], T[1:], atol=1e-9)
+
+
+@pytest.mark.parametrize("lag", [-0.2, 0.1, 0.2])
+def test_turns_that_a_recorder_read_between_two_frames_come_back(lag):
+    T = moved(tube_sequence.poses(12), some_twists(12, 1.0, 0.0))
+    turns = Rotation.from_matrix(T[:, :3, :3])
+    read = Slerp(np.arange(12), turns)(np.clip(np.arange(12) + lag, 0, 11))
+    written = T.copy()
+    written[:, :3, :3] = read.as_matrix()
+    found = replace(Corrections.none(written), shared=np.r_[np.zeros(12), -lag]).poses
+    off = (Rotation.from_matrix(found[:, :3, :3]).inv() * turns).magnitude()[4:-4]
+    was = (read.inv() * turns).magnitude()[4:-4]
+    assert off.max() < 0.1 * was.max()
 
 
 def test_slopes_of_sighted_vertices_are_those_of_finite_differences(tube):

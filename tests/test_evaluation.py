@@ -15,7 +15,7 @@ from endotwin.evaluation.evaluation import MEANS
 from endotwin.pipeline import fuse_twin
 from endotwin.render import Renderer
 from endotwin.sequence.readers import open_sequence
-from endotwin.twin import Light, Materials, Response, Twin
+from endotwin.twin import Light, Materials, Registration, Response, Twin
 
 JSON_KEYS = [*MEANS, "gamma", "light", "frames"]
 
@@ -209,3 +209,18 @@ def test_a_twin_is_scored_on_every_frame_of_another_recording_through_its_own_ca
         evaluate(twin, sequence=twin.source.path)
     with pytest.raises(OptionError, match="no photos to be compared with"):
         evaluate(renders=tmp_path)
+
+
+def test_a_half_of_a_photo_tells_where_the_other_half_was_taken(twin):
+    sequence = twin.sequence()
+    twist = np.r_[np.radians([0.1, -0.15, 0.1]), 0.1, -0.05, 0.1]
+    astray = replace(twin, registration=Registration((tuple(twist),) * len(sequence)))
+    true, shared = evaluate(twin), evaluate(astray, halves=True)
+    assert shared.psnr < true.psnr - 5
+    assert shared.mean("psnr_halves") > shared.psnr + 0.7 * (true.psnr - shared.psnr)
+    assert "psnr_halves" in str(shared) and "psnr_halves" not in str(true)
+
+
+def test_pictures_of_another_method_have_no_pose_to_fit(twin, tmp_path):
+    with pytest.raises(OptionError, match="--halves"):
+        evaluate(sequence=twin.source.path, renders=tmp_path, halves=True)

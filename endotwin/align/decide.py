@@ -32,7 +32,7 @@ GLANCE_PHOTOS, GLANCE_VERTICES = 12, 6_000
 JUDGES = 3
 """Every third photo judges what the others choose."""
 
-BLURS = (0.006, 0.003, 0.0015, 0.0015)
+BLURS = (0.006, 0.003, 0.0015, 0.0015, 0.0015, 0.0015)
 """Widths of the blurs, coarse to fine, of the image's width."""
 
 OWN_BLURS = (0.0015, 0.0015, 0.0015)
@@ -42,10 +42,6 @@ LEAST_BLUR_PX = 0.7
 MIN_GAIN_DB, MIN_SIGMAS = 0.5, 3.0
 """Corrections are kept where they lower other photos' error by so much, and by so many sigmas: what the model
 of light lacks is alike in all photos, and to move them all may hide a little of it."""
-
-TOLERATED_DB = 0.25
-"""Where photos were moved at all, what each has of its own has a tight prior, and stays unless judges lose so
-much: it sharpens what they are compared with, and they themselves get only its drift."""
 
 LEAST_PHOTOS = 8
 """Fewer can neither choose nor judge."""
@@ -121,7 +117,7 @@ class Aligner:
             return None, f"what the photos ask for does not help others ({gained})", gained
         own = self._steps(scene, shared, self.choosers, OWN_BLURS, own=True)
         more = self._errors(scene, own)
-        if more.better_than(now).gain_db > -TOLERATED_DB:
+        if _keeps(more.better_than(now)):
             best = self._steps(scene, own, self.frames, OWN_BLURS[:1], own=True)
             verdict = more.better_than(was)
             return best, f"shared and drift: {verdict}", verdict

@@ -5,7 +5,10 @@ from __future__ import annotations
 
 import numpy as np
 from scipy.interpolate import CubicSpline
-from scipy.spatial.transform import RigidTransform, Rotation, RotationSpline
+from scipy.spatial.transform import RigidTransform, Rotation
+
+CITTERT = 6
+"""Rounds in which turns between frames are undone."""
 
 
 def moved(T: np.ndarray, twists: np.ndarray) -> np.ndarray:
@@ -29,31 +32,43 @@ def adjoint(T: np.ndarray) -> np.ndarray:
 
 
 class Path:
-    """A smooth path through poses [N, 4, 4] at the times 0, 1, …; beyond its ends it goes on as there."""
+    """The path that written poses [N, 4, 4] tell of, at the times 0, 1, …; beyond its ends it goes on as
+    there."""
 
     def __init__(self, T_world_camera: np.ndarray):
         self.T_world_camera = T_world_camera
         times = np.arange(len(T_world_camera))
         if len(times) > 1:
             self._places = CubicSpline(times, T_world_camera[:, :3, 3])
-            self._turns = RotationSpline(times, Rotation.from_matrix(T_world_camera[:, :3, :3]))
 
     def later(self, lag: float) -> np.ndarray:
-        """The poses [N, 4, 4] of ``lag`` frames later."""
-        count = len(self.T_world_camera)
-        if lag == 0 or count < 2:
-            return self.T_world_camera.copy()
-        times = np.arange(count) + lag
-        inside = np.clip(times, 0, count - 1)
-        T = np.tile(np.eye(4), (count, 1, 1))
-        T[:, :3, :3] = self._turns(inside).as_matrix()
-        T[:, :3, 3] = self._places(inside)
-        for end in np.flatnonzero(times != inside):
-            before = self._at(2 * inside[end] - times[end])
-            T[end] = T[end] @ np.linalg.inv(before) @ T[end]
+        """The poses [N, 4, 4] of ``lag`` frames later: those that a clock off by as much would have written
+        so.
+
+        Places lie on a spline. A hand's turns shake from frame to frame, and a spline through what was read
+        between two frames smooths them twice: those are sought that give the written ones where a recorder
+        goes straight from one to the next (Van Cittert 1931).
+        """
+        written = self.T_world_camera.copy()
+        if lag == 0 or len(written) < 2:
+            return written
+        times, last = np.arange(len(written)), len(written) - 1
+        inside = np.clip(times + lag, 0, last)
+        beyond = (times + lag - inside)[:, None] * self._places(inside, 1)
+        T = written.copy()
+        T[:, :3, 3] = self._places(inside) + beyond
+        read = Rotation.from_matrix(written[:, :3, :3])
+        turns = _turned(read, lag)
+        known = np.flatnonzero((times - lag >= 0) & (times - lag <= last))
+        for _ in range(CITTERT):
+            turns[known] = turns[known] * _turned(turns, -lag)[known].inv() * read[known]
+        T[:, :3, :3] = turns.as_matrix()
         return T
 
-    def _at(self, time: float) -> np.ndarray:
-        T = np.eye(4)
-        T[:3, :3], T[:3, 3] = self._turns(time).as_matrix(), self._places(time)
-        return T
+
+def _turned(turns: Rotation, lag: float) -> Rotation:
+    """``turns`` of N frames, ``lag`` frames later, going straight from one to the next."""
+    times = np.arange(len(turns)) + lag
+    before = np.clip(np.floor(times).astype(int), 0, len(turns) - 2)
+    step = (turns[before].inv() * turns[before + 1]).as_rotvec()
+    return turns[before] * Rotation.from_rotvec(step * (times - before)[:, None])

@@ -54,14 +54,14 @@ def gradient(image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def read_photos(sequence: Sequence, frames: Iterable[int]) -> dict[int, Photo]:
     """The photos of ``frames``, by frame."""
+    frames, mask = list(frames), sequence.lens_mask
+    found = ahead(lambda frame: photo_of(sequence.color(frame), mask), frames, THREADS)
+    return dict(zip(frames, found, strict=True))
+
+
+def photo_of(color: np.ndarray, lens_mask: np.ndarray) -> Photo:
+    """Of colours uint8 [H, W, 3], inside ``lens_mask`` [H, W]."""
     beside = np.ones((BESIDE_PX, BESIDE_PX), np.uint8)
-    within = cv2.erode(sequence.lens_mask.astype(np.uint8), beside)
-
-    def read(frame: int) -> Photo:
-        color = sequence.color(frame)
-        clipped = (color.max(axis=2) >= CLIPPED).astype(np.uint8)
-        shown = within * (1 - cv2.dilate(clipped, beside))
-        return Photo(color.mean(axis=2, dtype=np.float32) / 255, shown.astype(np.float32))
-
-    frames = list(frames)
-    return dict(zip(frames, ahead(read, frames, THREADS), strict=True))
+    clipped = (color.max(axis=2) >= CLIPPED).astype(np.uint8)
+    shown = cv2.erode(lens_mask.astype(np.uint8), beside) * (1 - cv2.dilate(clipped, beside))
+    return Photo(color.mean(axis=2, dtype=np.float32) / 255, shown.astype(np.float32))

@@ -12,6 +12,9 @@ compared with their photos, both display-encoded in [0, 1]. Three kinds of pixel
 
 Where the camera changes its gain, that of a held-out frame is one number that no other photo tells. It is
 read from the frame's own photo, as the median of photo over twin, and kept with the scores.
+
+Where poses err from photo to photo, each half of a photo can be scored at a pose that was fitted to its other
+half: a score under another name, which says what the twin is worth, and not what sequence and twin are.
 """
 
 from __future__ import annotations
@@ -19,12 +22,15 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 
+from endotwin.align.photos import photo_of
+from endotwin.align.scene import Scene
+from endotwin.align.single import placed
 from endotwin.errors import OptionError, TwinError
 from endotwin.evaluation import metrics
 from endotwin.evaluation.highlights import Alike
@@ -53,7 +59,12 @@ MID_TONES = (0.1, 0.9)
 POOR_DB = 20.0
 """A twin with a lower PSNR does not look like its photos."""
 
-MEANS = ("psnr", "ssim", "lpips", "psnr_covered", "covered", "psnr_dull", "precision", "recall", "sizes")
+HALVES = ("psnr_halves", "psnr_halves_covered")
+
+MEANS = (
+    *("psnr", "ssim", "lpips", "psnr_covered", "covered", "psnr_dull", "precision", "recall", "sizes"),
+    *HALVES,
+)
 """Scores of which a twin keeps the mean."""
 
 ERROR_FULL_SCALE = 0.25
@@ -70,6 +81,8 @@ class FrameScore:
         psnr, ssim, lpips: over its valid pixels.
         psnr_covered, ssim_covered, lpips_covered: over its covered pixels.
         covered: fraction of the valid pixels that are covered; NaN where no twin tells.
+        psnr_halves, psnr_halves_covered: of each half of the photo at a pose that was fitted to the other
+            half; NaN where that was not asked for.
     """
 
     index: int
@@ -86,6 +99,8 @@ class FrameScore:
     precision: float
     recall: float
     sizes: float
+    psnr_halves: float = math.nan
+    psnr_halves_covered: float = math.nan
 
 
 @dataclass(frozen=True)
@@ -161,6 +176,8 @@ class Evaluation:
 
     def __str__(self) -> str:
         told = {"index", "name"} | ({"gain"} if all(frame.gain == 1 for frame in self.frames) else set())
+        if all(math.isnan(self.mean(name)) for name in HALVES):
+            told |= set(HALVES)
         scores = [field.name for field in fields(FrameScore) if field.name not in told]
         rows = [["frame", *scores]]
         for frame in self.frames:
@@ -271,6 +288,25 @@ def _shown_by_files(files: Mapping[int, Path], sequence: Sequence, twin: Twin | 
     return show
 
 
+def _halved(held_out: _HeldOut, sequence: Sequence, scene: Scene, show: Show) -> dict[str, float]:
+    """PSNR of each half of the photo at a pose that was fitted to the other."""
+    frame, photo, valid = held_out.frame, held_out.photo, held_out.valid
+    seen = photo_of(frame.color, sequence.lens_mask)
+
+    def at(T_world_camera: np.ndarray):
+        return show(replace(frame, T_world_camera=T_world_camera), photo, valid)
+
+    left = np.zeros_like(valid)
+    left[:, : valid.shape[1] // 2] = True
+    render, covered = np.zeros_like(photo), np.zeros_like(valid)
+    for scored in (left, ~left):
+        T_world_camera = placed(scene, seen, frame.T_world_camera, valid & ~scored, lambda T: at(T)[0])
+        shown, _, known = at(T_world_camera)
+        render[scored], covered[scored] = shown[scored], known[scored]
+    whole, of_covered = (metrics.psnr(photo, render, mask) for mask in (valid, covered))
+    return dict(zip(HALVES, (whole, of_covered), strict=True))
+
+
 def _score(held_out: _HeldOut) -> FrameScore:
     photo, render, valid = held_out.photo, held_out.render, held_out.valid
     covered = np.zeros_like(valid) if held_out.covered is None else held_out.covered
@@ -304,6 +340,7 @@ def evaluate(
     overwrite: bool = False,
     sequence: Sequence | Path | str | None = None,
     renders: Path | str | None = None,
+    halves: bool = False,
 ) -> Evaluation:
     """Score a fitted twin, or another method's pictures, on frames that were held out of the fit.
 
@@ -316,16 +353,20 @@ def evaluate(
         sequence: another recording of the twin's surface, in the same world frame, all of which is scored.
             With ``renders`` alone, the sequence whose held-out frames they show.
         renders: folder of pictures of the held-out frames, each named as its photo.
+        halves: also fit the pose of each photo to one half of it and score the other, and the reverse: what
+            the twin is worth where poses err from photo to photo.
 
     Raises:
         TwinError: the twin is not fitted, or no held-out frame has a valid pixel.
         SequenceError: the twin's sequence has moved, or a render is missing or of another size.
-        OptionError: ``sequence`` is the twin's own, or renders have none.
+        OptionError: ``sequence`` is the twin's own, renders have none, or their poses are asked for.
         OutputError: ``sheet`` exists or cannot be written.
     """
     kept = sequence is None and renders is None and not isinstance(twin, Twin)
     folder = twin if kept else None
     twin = None if twin is None and renders is not None else as_twin(twin)
+    if halves and renders is not None:
+        raise OptionError("pictures of another method have no pose to fit; leave --halves or --renders out")
     if sheet is not None:
         check_picture(sheet, overwrite)
     sequence, indices = _to_be_scored(twin, sequence, renders)
@@ -333,9 +374,12 @@ def evaluate(
         show = _shown_by_twin(twin, sequence)
     else:
         show = _shown_by_files(rendered_files(Path(renders), sequence, indices), sequence, twin)
+    scene = Scene.of(Caster(twin.surface), sequence.camera, 0) if halves else None
     scores, rows = [], []
     for held_out in _compared(sequence, indices, show, progress):
         scores.append(_score(held_out))
+        if scene is not None:
+            scores[-1] = replace(scores[-1], **_halved(held_out, sequence, scene, show))
         if sheet is not None:
             rows.append(_sheet_row(held_out, scores[-1]))
     if not scores:
