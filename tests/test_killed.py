@@ -88,7 +88,7 @@ def test_a_command_that_is_killed_leaves_old_or_new_and_the_next_sweeps(begun, t
     before = contents(begun)
     for after in np.unique(np.linspace(0, len(done) - 1, MOMENTS).astype(int)):
         _, code = run(tmp_path, begun, command, int(after))
-        assert code is None
+        assert code is None or "--budget" in command  # a second may hold less to write the next time
         Twin.load("twin")
         if (begun / target).is_file():
             assert Path(target).read_bytes() == before[begun / target] or len(Path(target).read_bytes()) > 9
