@@ -54,14 +54,18 @@ def gradient(image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def read_photos(sequence: Sequence, frames: Iterable[int]) -> dict[int, Photo]:
     """The photos of ``frames``, by frame."""
-    frames, mask = list(frames), sequence.lens_mask
-    found = ahead(lambda frame: photo_of(sequence.color(frame), mask), frames, THREADS)
+    frames, inside = list(frames), well_inside(sequence.lens_mask)
+    found = ahead(lambda frame: photo_of(sequence.color(frame), inside), frames, THREADS)
     return dict(zip(frames, found, strict=True))
 
 
-def photo_of(color: np.ndarray, lens_mask: np.ndarray) -> Photo:
-    """Of colours uint8 [H, W, 3], inside ``lens_mask`` [H, W]."""
-    beside = np.ones((BESIDE_PX, BESIDE_PX), np.uint8)
+def well_inside(lens_mask: np.ndarray) -> np.ndarray:
+    """Uint8 [H, W]: 1 off the edge of ``lens_mask``, bool [H, W]."""
+    return cv2.erode(lens_mask.astype(np.uint8), np.ones((BESIDE_PX, BESIDE_PX), np.uint8))
+
+
+def photo_of(color: np.ndarray, inside: np.ndarray) -> Photo:
+    """Of colours uint8 [H, W, 3], where ``inside`` [H, W] is 1."""
     clipped = (color.max(axis=2) >= CLIPPED).astype(np.uint8)
-    shown = cv2.erode(lens_mask.astype(np.uint8), beside) * (1 - cv2.dilate(clipped, beside))
+    shown = inside * (1 - cv2.dilate(clipped, np.ones((BESIDE_PX, BESIDE_PX), np.uint8)))
     return Photo(color.mean(axis=2, dtype=np.float32) / 255, shown.astype(np.float32))

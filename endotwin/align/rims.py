@@ -81,8 +81,9 @@ def rim(
     shown, holds = photo.blurred(sigma_px, met)
     predicted, told = log_blurred(twin, met * photo.shown, sigma_px)
     pixel = np.flatnonzero(band & holds & told & (predicted > np.log(DARKEST)))
-    slopes = moving_slopes(scene, predicted, distances, pixel, reach)
-    far = distances.reshape(-1)[pixel] > FARTHER * _nearest_mm(distances, pixel, reach)
+    nearest_mm = least_within(distances, reach).reshape(-1)[pixel].astype(np.float64)
+    slopes = moving_slopes(scene, predicted, pixel, nearest_mm)
+    far = distances.reshape(-1)[pixel] > FARTHER * nearest_mm
     cell_px = width / STRETCH_CELLS
     v, u = ((x / cell_px).astype(int) for x in np.divmod(pixel, width))
     stretch = np.unique((v * (STRETCH_CELLS + 1) + u) * 2 + far, return_inverse=True)[1].reshape(-1)
@@ -91,20 +92,19 @@ def rim(
 
 
 def moving_slopes(
-    scene: Scene, predicted: np.ndarray, distances: np.ndarray, pixel: np.ndarray, reach: int
+    scene: Scene, predicted: np.ndarray, pixel: np.ndarray, distance_mm: np.ndarray
 ) -> np.ndarray:
     """Slopes [P, 6], by the camera's twist, of photo − ``predicted`` [H, W] at ``pixel`` [P], whose picture
-    moves with the nearest surface within ``reach`` pixels."""
+    moves with a surface at ``distance_mm`` [P]."""
     slopes_uv = [slope.reshape(-1)[pixel].astype(np.float64) for slope in gradient(predicted)]
-    points = scene.rays[pixel].astype(np.float64) * _nearest_mm(distances, pixel, reach)[:, None]
+    points = scene.rays[pixel].astype(np.float64) * distance_mm[:, None]
     return by_twist(scene.by_point(pixel, *slopes_uv, points), points)
 
 
-def _nearest_mm(distances: np.ndarray, pixel: np.ndarray, reach: int) -> np.ndarray:
-    """[P]: the least of ``distances`` [H, W], in which 0 is none, within ``reach`` of ``pixel`` [P]."""
+def least_within(distances: np.ndarray, reach: int) -> np.ndarray:
+    """The least of ``distances`` [H, W], in which 0 is none, within ``reach`` of each pixel, float32."""
     beyond = np.where(distances > 0, distances, np.inf).astype(np.float32)
-    side = np.ones((2 * reach + 1,) * 2, np.uint8)
-    return cv2.erode(beyond, side).reshape(-1)[pixel].astype(np.float64)
+    return cv2.erode(beyond, np.ones((2 * reach + 1,) * 2, np.uint8))
 
 
 def _shaded(scene: Scene, hits, T_world_camera: np.ndarray, paint: Paint, light: np.ndarray) -> np.ndarray:

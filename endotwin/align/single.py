@@ -9,7 +9,7 @@ import numpy as np
 from endotwin.align.corrections import shared_spread
 from endotwin.align.motion import moved, twists_between
 from endotwin.align.photos import DARKEST, Photo, log_blurred
-from endotwin.align.rims import BAND_SIGMAS, moving_slopes
+from endotwin.align.rims import BAND_SIGMAS, least_within, moving_slopes
 from endotwin.align.scene import Scene
 from endotwin.align.within import HUBER
 
@@ -49,7 +49,8 @@ def placed(
         if len(pixel) < LEAST_PIXELS:
             return T_world_camera
         reach = int(np.ceil(BAND_SIGMAS * sigma_px))
-        slopes = moving_slopes(scene, predicted, distances, pixel, reach)
+        nearest_mm = least_within(distances, reach).reshape(-1)[pixel].astype(np.float64)
+        slopes = moving_slopes(scene, predicted, pixel, nearest_mm)
         left = (shown - predicted).reshape(-1)[pixel].astype(np.float64)
         left -= np.median(left)
         width = max(1.4826 * float(np.median(np.abs(left))), 1e-3)

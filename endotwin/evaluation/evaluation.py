@@ -28,7 +28,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from endotwin.align.photos import photo_of
+from endotwin.align.photos import photo_of, well_inside
 from endotwin.align.scene import Scene
 from endotwin.align.single import placed
 from endotwin.errors import OptionError, TwinError
@@ -291,7 +291,7 @@ def _shown_by_files(files: Mapping[int, Path], sequence: Sequence, twin: Twin | 
 def _halved(held_out: _HeldOut, sequence: Sequence, scene: Scene, show: Show) -> dict[str, float]:
     """PSNR of each half of the photo at a pose that was fitted to the other."""
     frame, photo, valid = held_out.frame, held_out.photo, held_out.valid
-    seen = photo_of(frame.color, sequence.lens_mask)
+    seen = photo_of(frame.color, well_inside(sequence.lens_mask))
 
     def at(T_world_camera: np.ndarray):
         return show(replace(frame, T_world_camera=T_world_camera), photo, valid)

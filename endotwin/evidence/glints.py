@@ -130,10 +130,10 @@ class Glints:
 def crossings_mm(samples: Samples, surface: Surface) -> tuple[np.ndarray, np.ndarray]:
     """Where N viewing rays, mirrored about the surface's normals, meet the plane of the lens: x and y in the
     camera frame [N, 2]; and which are steep enough to tell, bool [N]."""
-    rotation = samples.views.T_local_camera[:, :3, :3].astype(np.float32)[samples.views.row(samples.frame)]
     corners = surface.normals[surface.triangles[samples.triangle.numpy()]]
-    normals = np.einsum("nk,nka,nab->nb", samples.barycentric.numpy(), corners, rotation, optimize=True)
-    normals, view, points_mm = unit(normals), samples.directions, samples.points_mm
+    share, rotation = samples.barycentric.numpy(), samples.rotation
+    normals = unit(np.einsum("nk,nka,nab->nb", share, corners, rotation, optimize=True))
+    view, points_mm = samples.directions, samples.points_mm
     mirrored = view - 2 * dot(view, normals)[:, None] * normals
     down = np.minimum(mirrored[:, 2], -STEEPEST)
     at_mm = points_mm - (points_mm[:, 2] / down)[:, None] * mirrored

@@ -157,10 +157,10 @@ def fit_twin(
         wanted = states.get("coat", "auto") if "specular" in decided.effects else "off"
         count = min(LIGHT_PIXELS, int(LIGHT_SHARE * pace.start_pixels))
         rows = telling[torch.from_numpy(drawn(len(telling), count, np.random.default_rng(seed)))]
-        glints = np.flatnonzero(smooth & clipped)
-        count = len(glints) * len(rows) // len(every)
-        glints = glints[drawn(len(glints), count, np.random.default_rng(seed))]
-        parts = samples[rows], samples[torch.from_numpy(glints)]
+        white = np.flatnonzero(smooth & clipped)
+        count = len(white) * len(rows) // len(every)
+        white = white[drawn(len(white), count, np.random.default_rng(seed))]
+        parts = samples[rows], samples[torch.from_numpy(white)]
         state, cost, coat = _find_light(*parts, surface, start, pace, relighting, wanted, device)
     with stopwatch.stage("detail"):
         state, normals, left = _find_detail(samples, twin, state, cost, pace, relighting, device)

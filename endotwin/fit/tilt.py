@@ -109,8 +109,7 @@ class Tilter:
     ) -> tuple[np.ndarray, Tensor, Residual]:
         """By which tilt N samples change most: its axis in the surface's frame [N, 3], and dC by its
         radians [N, 3]; and their residuals, robust beyond ``width``."""
-        rotation = samples.views.T_local_camera[:, :3, :3].astype(np.float32)
-        rotation, view = rotation[samples.views.row(samples.frame)], samples.directions
+        rotation, view = samples.rotation, samples.directions
         normal = at_pixels(samples, self.solver.triangles, torch.from_numpy(normals)).numpy()
         normal = unit(np.einsum("na,nab->nb", normal, rotation))
         material = at_pixels(samples, self.solver.triangles, self.state.materials)

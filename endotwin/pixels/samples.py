@@ -121,6 +121,11 @@ class Samples:
         """Surface points in the camera frame, float32 [N, 3]."""
         return self.directions * self.log_distance.exp().numpy()[:, None]
 
+    @property
+    def rotation(self) -> np.ndarray:
+        """From the camera of each to the surface's frame, float32 [N, 3, 3]."""
+        return self.views.T_local_camera[:, :3, :3].astype(np.float32)[self.views.row(self.frame)]
+
     def lit(self, n: float, q: float, log_scale: float = 0.0) -> Lit:
         """What lights the pixels, where the light's n and q and the albedo's scale say what is bounced."""
         more = {"log_exposure": self.log_exposure}

@@ -42,13 +42,13 @@ def photographed(
 
     def seen(shot: Shot) -> torch.Tensor:
         """The radiance image on the sensor."""
-        radiance = expose(film, shot, timed)
+        radiance = expose(arriving, shot, timed)
         for name in OPTICS:
             if name in effects:
                 radiance = effects[name].through(radiance, view.depth_mm, camera)
         return radiance
 
-    def film(T: np.ndarray, mask: np.ndarray | None) -> torch.Tensor:
+    def arriving(T: np.ndarray, mask: np.ndarray | None) -> torch.Tensor:
         known = mask is None and T is T_world_camera
         return torch.from_numpy((view if known else renderer.view(T, mask)).radiance)
 
