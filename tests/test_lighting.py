@@ -44,3 +44,17 @@ def test_the_detail_begins_with_the_gains_that_the_fit_finds_of_all_frames(expos
     np.testing.assert_allclose(gain.log_gain, LOG_GAIN, atol=0.01)
     shown = gain.of(samples.frame.numpy())
     np.testing.assert_allclose(solver.samples.log_exposure.exp(), shown, rtol=1e-6)
+
+
+def test_a_frame_that_is_all_black_gets_a_gain_that_is_finite_and_leaves_the_others_theirs(exposed_unevenly):
+    twin, samples, state = exposed_unevenly
+    effects = Effects([Gain((0, 1, 2, 3, 4), (0.0,) * 5)])
+    relighting = Relighting(twin.surface, Caster(twin.surface), effects, samples.views)
+    black = torch.where((samples.frame == 4)[:, None], 0, samples.color)
+    samples = lit(replace(samples, color=black), twin.surface, Caster(twin.surface), relighting.effects)
+    solver = GaussNewton(samples, twin.surface.triangles, state.operator)
+    for _ in range(12):
+        relighting(solver, state)
+    log_gain = np.asarray(relighting.effects["gain"].log_gain)
+    assert np.isfinite(log_gain).all() and log_gain[4] < -2
+    np.testing.assert_allclose(np.diff(log_gain[:4]), np.diff(LOG_GAIN[:4]), atol=0.01)

@@ -156,7 +156,8 @@ class _Trial:
             light = Light(kept.hypothesis.bounced.L0, PRIOR["n"], PRIOR["q"])
             return Decided(effects, decisions, light, PRIOR["gamma"])
         plain = not set(effects) - {"specular"}
-        return Decided(effects, decisions, None if plain else Light(0.0, kept.n, kept.q), kept.gamma)
+        n, q, gamma = kept.start
+        return Decided(effects, decisions, None if plain else Light(0.0, n, q), gamma)
 
     def _sets(self, names: Iterable[str]) -> list[frozenset[str]]:
         """All sets of the effects ``names`` that are wanted, in which those that are forced are on."""
@@ -266,5 +267,5 @@ class _Trial:
             log_gain = kept.log_gain - kept.log_gain.mean()
             effects.append(Gain(tuple(map(int, probe.frames)), tuple(map(float, log_gain))))
         if hypothesis.vignetting:
-            effects.append(Vignetting(k2=float(kept.effects.coefficients[3] / kept.gamma)))
+            effects.append(Vignetting(k2=float(kept.effects.coefficients[3] / kept.start[2])))
         return Effects(effects)

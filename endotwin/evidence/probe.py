@@ -130,7 +130,7 @@ class Fitted:
     @property
     def log_gain(self) -> np.ndarray:
         """ln of each frame's gain, float64 [F]; 0 in the first."""
-        return self.effects.intercepts / self.gamma
+        return self.effects.intercepts / self.start[2]
 
     @property
     def n(self) -> float:
@@ -147,6 +147,11 @@ class Fitted:
         if not least < self.gamma < most:  # it is 0 where all photos are white, and n and q are 0/0
             return False
         return all(low < value < high for value, (low, high) in zip((self.n, self.q), bounds, strict=True))
+
+    @property
+    def start(self) -> tuple[float, float, float]:
+        """n, q and γ to start a fit from: those of the priors, where its own are no endoscope's."""
+        return (self.n, self.q, self.gamma) if self.possible else (PRIOR["n"], PRIOR["q"], PRIOR["gamma"])
 
 
 class Probe:

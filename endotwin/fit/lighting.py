@@ -23,6 +23,9 @@ from endotwin.surface import Surface
 from endotwin.surface.casting import Caster
 from endotwin.surface.vectors import unit
 
+MOST_STEP = 1.0
+"""Of the logarithm of a gain: a photo all black or white tells none, and its slope is next to nothing."""
+
 
 def lit(samples: Samples, surface: Surface, caster: Caster, effects: Effects) -> Samples:
     """``samples`` as the effects light and expose them, all but interreflection."""
@@ -88,6 +91,16 @@ class Relighting:
     @property
     def needed(self) -> bool:
         return self.bounces or "gain" in self.effects
+
+    @property
+    def gained_frames(self) -> int:
+        """How many frames have a gain of their own."""
+        return len(self.effects["gain"].frames) if "gain" in self.effects else 0
+
+    def regain(self, solver: GaussNewton, log_gain: np.ndarray) -> None:
+        """Add to the logarithm of each frame's gain [F], and relight the samples of ``solver``."""
+        self.effects = _brightened(self.effects, log_gain)
+        solver.relight(exposed(solver.samples, self.effects))
 
     def without_bounce(self, solver: GaussNewton, state: State) -> State:
         """From here on no light bounces: the photos show none. ``state`` as if there had never been any."""
@@ -161,5 +174,9 @@ def regained(samples: Samples, material: Tensor, shared: Globals, effects: Effec
         np.bincount(frame, (residual.weight * slope * other).sum(dim=1).numpy(), len(gain.frames))
         for other in (residual.error, slope)
     )
-    log_gain = np.asarray(gain.log_gain) + pull / np.maximum(normal, 1e-12)
-    return effects.including(Gain.centred(gain.frames, log_gain))
+    return _brightened(effects, pull / np.maximum(normal, 1e-12))
+
+
+def _brightened(effects: Effects, log_gain: np.ndarray) -> Effects:
+    gain, step = effects["gain"], np.clip(log_gain, -MOST_STEP, MOST_STEP)
+    return effects.including(Gain.centred(gain.frames, np.add(gain.log_gain, step)))

@@ -259,7 +259,10 @@ def _find_light(
         if relighting.bounces:
             solver.held = (*start.undetermined, "L0", *(("albedo scale",) * (number < HOLD_STEPS)))
         else:
-            shared = within.renewed(material, shared, start.undetermined, noise)
+            frames = relighting.gained_frames
+            shared, log_gain = within.renewed(material, shared, start.undetermined, noise, frames)
+            if frames:
+                relighting.regain(solver, log_gain)
         state = replace(state, shared=shared)
         if late:
             break

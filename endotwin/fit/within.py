@@ -3,6 +3,9 @@
 Each vertex has an albedo that nobody knows. In log C that is an intercept of its own, and subtracting the
 vertex's mean takes it out exactly: what is left varies with distance, angle and frame only. Unlike a fit
 beside smooth albedo features, no texture can pass for shading, whatever those features cannot follow.
+
+The gain of a frame is an intercept, too. A camera that comes nearer turns its gain down, so that gains pass
+for most of the fall-off: found in turns with it, they would stay where they were first guessed.
 """
 
 from __future__ import annotations
@@ -47,11 +50,12 @@ class Sightings:
     """What the pixels of a vertex in one photo tell together, S of them.
 
     Attributes:
-        vertex: int [S]. residual: ln photo − ln prediction [S]. slopes: d ln C by the shared parameters [S,
-            G]. by_coat: d ln C by the coat's weight [S], 0 without one. weight: inverse variance [S].
+        vertex, frame: int [S]. residual: ln photo − ln prediction [S]. slopes: d ln C by the shared
+            parameters [S, G]. by_coat: d ln C by the coat's weight [S], 0 without one. weight: inverse variance [S].
     """
 
     vertex: np.ndarray
+    frame: np.ndarray
     residual: np.ndarray
     slopes: np.ndarray
     by_coat: np.ndarray
@@ -75,19 +79,22 @@ class Within:
     def of(cls, samples: Samples, surface: Surface, unit_mm: float) -> Within:
         return cls(samples, samples.nearest(surface.triangles), len(surface.vertices_mm), unit_mm)
 
-    def renewed(self, material: Tensor, shared: Globals, held: tuple[str, ...], noise: float) -> Globals:
+    def renewed(
+        self, material: Tensor, shared: Globals, held: tuple[str, ...], noise: float, frames: int = 0
+    ) -> tuple[Globals, np.ndarray]:
         """``shared`` after a Gauss–Newton step: light and response by what is off the highlights, then f0 and
-        the coat by all.
+        the coat by all; and what the first adds to the logarithms of the ``frames``' gains, [frames].
 
         Args:
             material: [N, 4] at the samples. held: which of n, q and gamma stay. noise: of a pixel, in display
-                values.
+                values. frames: of the samples' views, if each has a gain of its own; 0: none has.
         """
         diffuse = self.samples.sin2 > DIFFUSE_SIN2
-        shared = self._step(material, shared, (*held, "level", "f0"), diffuse, noise)
-        if not shared.specular:
-            return shared
-        return self._step(material, shared, ("level", "n", "q", "gamma"), torch.ones_like(diffuse), noise)
+        shared, log_gain = self._step(material, shared, (*held, "level", "f0"), diffuse, noise, frames)
+        if shared.specular:
+            kept = ("level", "n", "q", "gamma")
+            shared, _ = self._step(material, shared, kept, torch.ones_like(diffuse), noise)
+        return shared, log_gain
 
     def highlights(self, material: Tensor, shared: Globals, noise: float) -> Callable[[Coat], Highlights]:
         """Sightings near the mirror direction, by a coat of weight 0 over them.
@@ -105,13 +112,19 @@ class Within:
         return under
 
     def _step(
-        self, material: Tensor, shared: Globals, held: tuple[str, ...], chosen: Tensor, noise: float
-    ) -> Globals:
+        self,
+        material: Tensor,
+        shared: Globals,
+        held: tuple[str, ...],
+        chosen: Tensor,
+        noise: float,
+        frames: int = 0,
+    ) -> tuple[Globals, np.ndarray]:
         coated = "f0" not in held and shared.coat is not None
         free = free_directions(shared, held)
         seen = self.sightings(material, shared, chosen, noise)
         if not free.shape[1] or len(seen.residual) < LEAST_SIGHTINGS:
-            return shared
+            return shared, np.zeros(frames)
         mean, spread = (x.numpy() for x in global_prior(self.unit_mm, len(shared.vector)))
         precision = free.T @ np.diag(TEMPER / spread**2) @ free
         pull = free.T @ (TEMPER * (mean - shared.vector.numpy()) / spread**2)
@@ -120,14 +133,17 @@ class Within:
             columns = np.c_[columns, seen.by_coat]
             precision = scipy.linalg.block_diag(precision, TEMPER / COAT_SPREAD**2)
             pull = np.r_[pull, -TEMPER * shared.coat.weight / COAT_SPREAD**2]
-        design = Design(columns, seen.vertex, self.count, weight=seen.weight, prior=(precision, pull))
-        found = regress(seen.residual, design, rounds=REWEIGHTS).coefficients
+        frame = np.searchsorted(self.samples.views.frames, seen.frame) if frames else None
+        design = Design(columns, seen.vertex, self.count, frame, seen.weight, (precision, pull))
+        fitted = regress(seen.residual, design, frames, rounds=REWEIGHTS)
+        found = fitted.coefficients
         along = free @ found[: free.shape[1]]
         length = min(1.0, float((spread / np.maximum(np.abs(along), 1e-12)).min()))
         if coated:
             weight = max(0.0, shared.coat.weight + length * float(found[-1]))
             shared = replace(shared, coat=replace(shared.coat, weight=weight))
-        return bounded(shared, shared.vector + torch.from_numpy(length * along))
+        log_gain = length / shared.gamma * fitted.intercepts if frames else np.zeros(0)
+        return bounded(shared, shared.vector + torch.from_numpy(length * along)), log_gain
 
     def sightings(self, material: Tensor, shared: Globals, chosen: Tensor, noise: float) -> Sightings:
         """Sightings of the ``chosen`` samples (bool [N]) that are neither dark nor clipped; but under a coat
@@ -158,4 +174,5 @@ class Within:
         total = np.bincount(which, weight, len(place))
         averaged = (residual, by_coat, *slopes.T)
         means = [np.bincount(which, weight * column, len(place)) / total for column in averaged]
-        return Sightings(place >> 32, means[0], np.stack(means[2:], axis=1), means[1], total)
+        frame = (place & 0xFFFFFFFF).astype(np.int32)
+        return Sightings(place >> 32, frame, means[0], np.stack(means[2:], axis=1), means[1], total)

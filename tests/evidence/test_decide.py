@@ -87,6 +87,15 @@ def test_an_effect_that_gains_little_is_not_kept_beside_a_light_that_no_endoscop
     assert not probe.compare(plain, replace(gained, effects=towards_the_sides)).keep
 
 
+def test_a_light_that_no_endoscope_has_is_no_place_to_start_a_fit_from(example):
+    twin, caster, samples, _ = example
+    found = Probe(samples, twin, caster).fit(Hypothesis(gain=True))
+    assert found.start == (found.n, found.q, found.gamma)
+    flat = replace(found, effects=replace(found.effects, coefficients=1e-9 * found.effects.coefficients))
+    assert flat.start == (2.0, 2.0, 1 / 2.2)
+    assert np.abs(flat.log_gain).max() < 2.2 * np.abs(found.effects.intercepts).max() + 1e-9
+
+
 def test_a_profile_that_is_no_cosine_is_found(example):
     twin, caster, samples, glints = example
     cos_axis = samples.log_cos_axis.exp().numpy()
