@@ -15,6 +15,7 @@ from endotwin.run.output import (
     check_apart,
     check_free,
     check_picture,
+    copy_folder,
     move_folder,
     whole_file,
     write_folder,
@@ -208,6 +209,22 @@ def test_a_folder_whose_names_change_their_content_is_old_or_new_wherever_it_is_
 
     begin()
     assert killed_at_every_operation(work, look) >= 10
+
+
+def test_a_copy_of_a_folder_is_there_whole_or_not_at_all_wherever_its_making_is_killed(tmp_path):
+    folder, copy = tmp_path / "one", tmp_path / "two"
+    (folder / "in").mkdir(parents=True)
+    write_texts(folder, a="1", b="2")
+    write_texts(folder / "in", c="3")
+
+    def look() -> None:
+        assert not copy.exists() or contents(copy) == contents(folder)
+        shutil.rmtree(copy, ignore_errors=True)
+        copy_folder(folder, copy)
+        assert contents(copy) == contents(folder) and set(tmp_path.iterdir()) == {folder, copy}
+        shutil.rmtree(copy)
+
+    assert killed_at_every_operation(lambda: copy_folder(folder, copy), look) >= 8
 
 
 def test_what_a_living_run_is_writing_is_not_swept(tmp_path):

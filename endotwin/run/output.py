@@ -232,6 +232,13 @@ def move_folder(new: Path, path: Path, own: Callable[[Path], bool]) -> None:
                 raise
 
 
+def copy_folder(path: Path, copy: Path) -> None:
+    """Make ``copy``, which is not there, of the folder ``path``: whole or not at all."""
+    with _workplace(Path(copy).absolute().parent) as work:
+        shutil.copytree(path, work / "copy")
+        (work / "copy").rename(copy)
+
+
 def goes_on(work: Path, mark: str, asked: dict, another: str) -> bool:
     """Whether the folder ``work`` holds what a run has done so far that ``asked`` the same, as its file
     ``mark`` says. A folder whose place another has taken is removed.
