@@ -16,6 +16,7 @@ from endotwin.run.output import (
     check_free,
     check_picture,
     copy_folder,
+    goes_on,
     move_folder,
     whole_file,
     write_folder,
@@ -225,6 +226,21 @@ def test_a_copy_of_a_folder_is_there_whole_or_not_at_all_wherever_its_making_is_
         shutil.rmtree(copy)
 
     assert killed_at_every_operation(lambda: copy_folder(folder, copy), look) >= 8
+
+
+def test_work_that_goes_on_is_swept_of_what_was_being_written_when_it_was_killed(tmp_path):
+    def look() -> None:
+        assert goes_on(tmp_path, "mark", {"asked": 1}, "another")
+        assert set(contents(tmp_path)) <= {"mark", "results/1"} and len(list(tmp_path.rglob("*/"))) == 1
+        (tmp_path / "results" / "1").unlink(missing_ok=True)
+
+    def work() -> None:
+        with whole_file(tmp_path / "results" / "1") as file:
+            file.write_text("1")
+
+    write_texts(tmp_path, mark='{"asked": 1}', results_0="")
+    (tmp_path / "results" / "0").unlink()
+    assert killed_at_every_operation(work, look) >= 5
 
 
 def test_what_a_living_run_is_writing_is_not_swept(tmp_path):
