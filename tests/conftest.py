@@ -1,6 +1,11 @@
 """Fixtures shared by all tests."""
 
 import os
+
+if "PYTEST_XDIST_WORKER_COUNT" in os.environ:  # before any library counts the cores: workers share them
+    share = (os.cpu_count() or 1) // int(os.environ["PYTEST_XDIST_WORKER_COUNT"])
+    os.environ.setdefault("OMP_NUM_THREADS", str(max(1, share)))
+
 import signal
 from collections.abc import Iterator
 from pathlib import Path
