@@ -130,6 +130,22 @@ def write_c3vd_v2_npz(folder: Path) -> Path:
     return folder
 
 
+def write_c3vd_float(folder: Path) -> Path:
+    write_c3vd(folder)
+    for index in range(FRAMES):
+        tifffile.imwrite(folder / f"{index:04d}_depth.tiff", np.full((HEIGHT, WIDTH), 14.0, np.float32))
+    return folder
+
+
+def write_transforms_split(folder: Path) -> Path:
+    write_transforms(folder)
+    content = json.loads((folder / "transforms.json").read_text())
+    (folder / "transforms.json").unlink()
+    for name, frames in (("train", content["frames"][1:]), ("test", content["frames"][:1])):
+        (folder / f"transforms_{name}.json").write_text(json.dumps({**content, "frames": frames}))
+    return folder
+
+
 def write_simcol(folder: Path) -> Path:
     size = (SIMCOL_SIZE, SIMCOL_SIZE)
     _photo(folder / "FrameBuffer_0000.png", 0, size)
@@ -159,11 +175,13 @@ WRITERS: dict[str, Callable[[Path], Path]] = {
     for writer in (
         write_c3vd,
         write_c3vd_exr,
+        write_c3vd_float,
         write_c3vd_v2,
         write_c3vd_v2_npz,
         write_transforms,
         write_transforms_masked,
         write_transforms_npy,
+        write_transforms_split,
         write_simcol,
         write_tum,
     )
