@@ -17,6 +17,8 @@ WIDTH, HEIGHT, FRAMES = 16, 12, 3
 CAMERA = {"model": "pinhole", "width": WIDTH, "height": HEIGHT, "fx": 10, "fy": 10, "cx": 7.5, "cy": 5.5}
 ROTATION_AND_PLACE = np.eye(4)
 SIMCOL_SIZE = 475
+HEAD = 200
+"""Bytes at the beginning of a file, which say what it is."""
 
 ODD_NUMBERS = ["nan", "inf", "-inf", "1e400", "-0", "9" * 400, "1e308", "x", "", "0x10", "1_0", "½", "-1"]
 ODD_VALUES = [
@@ -218,7 +220,8 @@ def damaged(draw: st.DrawFn, contents: dict[Path, bytes]) -> tuple[Path, bytes]:
     if kind == "flip":
         spoilt = bytearray(content)
         for _ in range(draw(st.integers(1, 4))):
-            spoilt[draw(st.integers(0, len(spoilt) - 1))] ^= 1 << draw(st.integers(0, 7))
+            end = min(len(spoilt), draw(st.sampled_from([HEAD, len(spoilt)])))
+            spoilt[draw(st.integers(0, end - 1))] ^= 1 << draw(st.integers(0, 7))
         return path, bytes(spoilt)
     if kind == "swap":
         return path, contents[draw(st.sampled_from(sorted(contents)))]
