@@ -23,6 +23,8 @@ venv: .venv/.installed
 demo: venv
 	$(BIN)/python examples/demo.py
 
+test test-fast: export PYTHONDONTWRITEBYTECODE :=  # else every process compiles all of it again
+
 test: venv
 	$(BIN)/python -m pytest -n auto --dist loadfile
 

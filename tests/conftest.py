@@ -1,14 +1,20 @@
 """Fixtures shared by all tests."""
 
 import os
+
+if "PYTEST_XDIST_WORKER_COUNT" in os.environ:  # before any library counts the cores: workers share them
+    share = (os.cpu_count() or 1) // int(os.environ["PYTEST_XDIST_WORKER_COUNT"])
+    os.environ.setdefault("OMP_NUM_THREADS", str(max(1, share)))
+
 import signal
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 import tube_sequence
 
 import endotwin
+from endotwin.run import locks
 
 
 @pytest.fixture(scope="session")
@@ -23,6 +29,25 @@ def data_root() -> Path:
 def example() -> Path:
     """The bundled example sequence."""
     return Path(__file__).parents[1] / "examples" / "colon_small"
+
+
+@pytest.fixture(scope="session")
+def fused(example, tmp_path_factory) -> Callable[[float], endotwin.Twin]:
+    """The twin of the bundled example at a scale, fused once a run, whichever worker needs it first."""
+    root = tmp_path_factory.getbasetemp()
+    root = root.parent if "PYTEST_XDIST_WORKER" in os.environ else root
+    (root / "fused").mkdir(exist_ok=True)
+
+    def fused(scale: float = 1.0) -> endotwin.Twin:
+        kept, lock = root / "fused" / str(scale), locks.take(root)
+        try:
+            if not kept.exists():
+                endotwin.fuse_twin(example, scale=scale).save(kept)
+            return endotwin.Twin.load(kept)
+        finally:
+            locks.release(lock)
+
+    return fused
 
 
 @pytest.fixture(scope="module")

@@ -14,6 +14,7 @@ from endotwin.cameras import Camera, Omni, Pinhole
 from endotwin.sequence import Sequence
 
 FARTHEST_MM = 100.0
+ALMOST_MM = 1e-4
 
 
 @dataclass(frozen=True)
@@ -35,11 +36,13 @@ class Scene:
         """Distance [N] along unit rays [N, 3] from ``origin`` [3] to the surface; NaN beyond
         ``FARTHEST_MM``."""
         t = np.zeros(len(directions))
+        on_the_way = np.arange(len(directions))
         for _ in range(150):
-            t -= 0.6 * np.minimum(self.height(origin + t[:, None] * directions), 0)
-            t = np.minimum(t, 2 * FARTHEST_MM)
+            left = self.height(origin + t[on_the_way, None] * directions[on_the_way])
+            on_the_way, left = on_the_way[left < -ALMOST_MM], left[left < -ALMOST_MM]
+            t[on_the_way] = np.minimum(t[on_the_way] - 0.6 * left, 2 * FARTHEST_MM)
         ahead = t + 0.5
-        for _ in range(40):
+        for _ in range(25):
             middle = (t + ahead) / 2
             inside = self.height(origin + middle[:, None] * directions) < 0
             t, ahead = np.where(inside, middle, t), np.where(inside, ahead, middle)

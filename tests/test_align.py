@@ -147,7 +147,7 @@ def test_corrected_poses_are_read_back(tube, tmp_path, format):
     np.testing.assert_allclose(read_poses(tmp_path / "poses.txt")[0], sequence.T_world_camera, atol=1e-9)
 
 
-def hand_eye_error(example: Path, folder: Path, twist: np.ndarray) -> np.ndarray:
+def hand_eye_error(twin: Twin, example: Path, folder: Path, twist: np.ndarray) -> np.ndarray:
     """The example's photos beside depth of its surface at other poses, which a wrong hand-eye matrix
     gives."""
     import cv2
@@ -155,7 +155,6 @@ def hand_eye_error(example: Path, folder: Path, twist: np.ndarray) -> np.ndarray
 
     from endotwin.surface.casting import Caster
 
-    twin = endotwin.fuse_twin(example)
     sequence, caster = twin.sequence(), Caster(twin.surface)
     true = sequence.T_world_camera
     written = moved(true, -twist)
@@ -174,9 +173,9 @@ def hand_eye_error(example: Path, folder: Path, twist: np.ndarray) -> np.ndarray
 
 
 @pytest.mark.slow
-def test_a_hand_eye_error_is_found_and_held_out_photos_gain(example, tmp_path, capsys):
+def test_a_hand_eye_error_is_found_and_held_out_photos_gain(fused, example, tmp_path, capsys):
     twist = np.r_[np.radians([0.1, -0.1, 0.07]), 0.2, -0.2, 0.15]
-    true = hand_eye_error(example, tmp_path / "spoilt", twist)
+    true = hand_eye_error(fused(), example, tmp_path / "spoilt", twist)
     write_c3vd_poses(tmp_path / "true.txt", true)
     assert invoke("fuse", tmp_path / "spoilt", "-o", tmp_path / "twin") == 0
     plain = endotwin.evaluate(endotwin.fit_twin(tmp_path / "twin", align="off"))
@@ -195,8 +194,8 @@ def test_a_hand_eye_error_is_found_and_held_out_photos_gain(example, tmp_path, c
 
 
 @pytest.mark.slow
-def test_photos_that_lie_on_the_surface_stay(example):
-    aligned = endotwin.align_twin(endotwin.fuse_twin(example))
+def test_photos_that_lie_on_the_surface_stay(fused):
+    aligned = endotwin.align_twin(fused())
     assert aligned.registration is None
 
 

@@ -594,7 +594,7 @@ def test_no_command_shows_the_help(endotwin):
 def test_the_installed_command_reports_errors_without_a_traceback(tmp_path):
     command = Path(sys.executable).with_name("endotwin")
     done = subprocess.run(
-        [command, "eval", tmp_path / "nothing"], capture_output=True, text=True, encoding="utf-8"
+        [command, "effects", tmp_path / "nothing"], capture_output=True, text=True, encoding="utf-8"
     )
     assert done.returncode == 2
     assert done.stderr.startswith("error: ") and done.stderr.count("\n") == 1

@@ -28,8 +28,8 @@ def heldout(twin):
         yield renderer.view(sequence.T_world_camera[index]).color, sequence.frame(index).color / 255
 
 
-def test_no_dots_remain_along_rims_in_the_held_out_renders_of_the_example(example):
-    for render, photo in heldout(endotwin.fit_twin(endotwin.fuse_twin(example))):
+def test_no_dots_remain_along_rims_in_the_held_out_renders_of_the_example(fused):
+    for render, photo in heldout(endotwin.fit_twin(fused())):
         assert not dots(render, photo).any()
         brightness = render.max(axis=2)
         usual = cv2.medianBlur(brightness, 5)

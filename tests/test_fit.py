@@ -38,9 +38,9 @@ def tube(tmp_path_factory) -> endotwin.Twin:
 
 
 @pytest.fixture(scope="module")
-def colon(example) -> endotwin.Twin:
+def colon(fused) -> endotwin.Twin:
     """The bundled example at half its size, fitted."""
-    return endotwin.fit_twin(endotwin.fuse_twin(example, scale=0.5))
+    return endotwin.fit_twin(fused(0.5))
 
 
 def made(sequence: Path) -> dict:

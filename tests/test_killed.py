@@ -1,12 +1,17 @@
 """A kill at a change of a file, of every command that writes: old or new, and the next leaves no trace."""
 
+import io
 import json
 import re
 import shutil
+from contextlib import chdir, redirect_stdout
 from pathlib import Path
+from subprocess import CompletedProcess
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import tube_sequence
 from command_line import invoke
 from faults import Killed, killed
 from test_full_disk import COMMANDS, contents
@@ -28,11 +33,16 @@ OVER = {
     "export of a package": ("new.usdz", "export twin new.usdz"),
     "export of a page": ("new.html", "export twin new.html"),
 }
-LONG = {"tradeoff", "preview", "study"}
-"""One whose commands run in processes of their own, one that takes long to write a file as others do, and
-one that trains for minutes."""
+STUDY = "study depth --real tube --twin twin --test other --network small --frames 2 --steps 1"
+TRADEOFF = "tradeoff tube --rungs draft+budget=1 --repeats 1"
+LONG = {
+    "tradeoff": ("new", f"{TRADEOFF} -o new"),
+    "tradeoff over another": ("traded", f"{TRADEOFF} -o traded --overwrite"),
+    "study": ("new", f"{STUDY} --seeds 1 -o new"),
+    "study that goes on from another": ("studied", f"{STUDY} --seeds 2 -o studied --overwrite"),
+}
 
-ALL = {name: each for name, each in {**COMMANDS, **OVER}.items() if name not in LONG}
+ALL = {**COMMANDS, **OVER, **LONG}
 
 
 @pytest.fixture(scope="module")
@@ -41,13 +51,30 @@ def begun(made, tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("begun")
     for name in ("tube", "twin"):
         shutil.copytree(made / name, folder / name)
+    tube_sequence.write(folder / "other", 1, 40, 30)
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
+        for begin in (f"{TRADEOFF} -o traded", f"{STUDY} --seeds 1 -o studied"):
+            assert invoke(*begin.split()) == 0
         assert invoke("synth", "twin", "--trajectory", "jitter:frames=3", "-o", "dataset") == 0
         for name in ("old.obj", "old.mitsuba"):
             assert invoke("export", "twin", name) == 0
     (folder / "old.glb").write_bytes(b"old")
     return folder
+
+
+@pytest.fixture(scope="module", autouse=True)
+def in_one_process():
+    """Commands that ``tradeoff`` runs in processes of their own are killed with it."""
+
+    def run(command, cwd, **_) -> CompletedProcess:
+        with chdir(cwd), redirect_stdout(io.StringIO()) as out:
+            code = invoke(*command[3:])
+        return CompletedProcess(command, code, out.getvalue(), "")
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("endotwin.tradeoff.measure.subprocess", SimpleNamespace(run=run))
+        yield
 
 
 def run(folder: Path, begun: Path, command: str, after: int | None) -> tuple[list[str], int | None]:
@@ -75,6 +102,12 @@ def is_new(dataset: str) -> bool:
     return json.loads(Path(dataset, "dataset.json").read_text(encoding="utf-8"))["frames"] == 2
 
 
+def moments(done: list[str], count: int) -> list[int]:
+    """So many of the operations, evenly; of writes in a row only the first counts."""
+    telling = [k for k, each in enumerate(done) if each != "write" or k == 0 or done[k - 1] != "write"]
+    return [telling[k] for k in np.unique(np.linspace(0, len(telling) - 1, count).astype(int))]
+
+
 @pytest.mark.parametrize("name", ALL)
 def test_a_command_that_is_killed_leaves_old_or_new_and_the_next_sweeps(begun, tmp_path, monkeypatch, name):
     if "usdz" in ALL[name][1]:
@@ -86,14 +119,16 @@ def test_a_command_that_is_killed_leaves_old_or_new_and_the_next_sweeps(begun, t
     assert code == 0 and done
     new = names(tmp_path)
     before = contents(begun)
-    for after in np.unique(np.linspace(0, len(done) - 1, MOMENTS).astype(int)):
-        _, code = run(tmp_path, begun, command, int(after))
-        assert code is None or "--budget" in command  # a second may hold less to write the next time
+    for after in moments(done, MOMENTS):
+        _, code = run(tmp_path, begun, command, after)
+        assert code is None or "budget" in command  # a second may hold less to write the next time
         Twin.load("twin")
         if (begun / target).is_file():
             assert Path(target).read_bytes() == before[begun / target] or len(Path(target).read_bytes()) > 9
         if target == "dataset":
             assert len(list(Path(target).glob("*_color.png"))) == (2 if is_new(target) else 3)
+        if name in LONG and Path(target).exists():
+            assert len(list(Path(target).glob("*.html"))) == 1
         again = command if "--overwrite" in command else f"{command} --overwrite"
         assert invoke(*again.split()) == 0
         assert names(tmp_path) == new

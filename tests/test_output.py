@@ -15,6 +15,8 @@ from endotwin.run.output import (
     check_apart,
     check_free,
     check_picture,
+    copy_folder,
+    goes_on,
     move_folder,
     whole_file,
     write_folder,
@@ -208,6 +210,37 @@ def test_a_folder_whose_names_change_their_content_is_old_or_new_wherever_it_is_
 
     begin()
     assert killed_at_every_operation(work, look) >= 10
+
+
+def test_a_copy_of_a_folder_is_there_whole_or_not_at_all_wherever_its_making_is_killed(tmp_path):
+    folder, copy = tmp_path / "one", tmp_path / "two"
+    (folder / "in").mkdir(parents=True)
+    write_texts(folder, a="1", b="2")
+    write_texts(folder / "in", c="3")
+
+    def look() -> None:
+        assert not copy.exists() or contents(copy) == contents(folder)
+        shutil.rmtree(copy, ignore_errors=True)
+        copy_folder(folder, copy)
+        assert contents(copy) == contents(folder) and set(tmp_path.iterdir()) == {folder, copy}
+        shutil.rmtree(copy)
+
+    assert killed_at_every_operation(lambda: copy_folder(folder, copy), look) >= 8
+
+
+def test_work_that_goes_on_is_swept_of_what_was_being_written_when_it_was_killed(tmp_path):
+    def look() -> None:
+        assert goes_on(tmp_path, "mark", {"asked": 1}, "another")
+        assert set(contents(tmp_path)) <= {"mark", "results/1"} and len(list(tmp_path.rglob("*/"))) == 1
+        (tmp_path / "results" / "1").unlink(missing_ok=True)
+
+    def work() -> None:
+        with whole_file(tmp_path / "results" / "1") as file:
+            file.write_text("1")
+
+    write_texts(tmp_path, mark='{"asked": 1}', results_0="")
+    (tmp_path / "results" / "0").unlink()
+    assert killed_at_every_operation(work, look) >= 5
 
 
 def test_what_a_living_run_is_writing_is_not_swept(tmp_path):

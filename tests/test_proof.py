@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from functools import cache
 from pathlib import Path
 
 import cv2
@@ -15,8 +16,10 @@ from endotwin.sequence.images import read_color
 from endotwin.synth import LAYOUTS, Trajectory, parse_labels, prove, synthesize
 from endotwin.synth.encodings import ENCODINGS
 from endotwin.synth.proof import CLAIMS, Written
+from endotwin.twin import Twin
 
 FRAMES = 3
+CAMERA = tube_twin.CAMERA.scaled(2)
 
 
 def poses() -> np.ndarray:
@@ -26,12 +29,17 @@ def poses() -> np.ndarray:
     return found
 
 
+@cache
+def twin() -> Twin:
+    """A tube with folds that hide each other."""
+    return tube_twin.fitted(tube_twin.seen(tube_twin.surface(fold_mm=3.0)))
+
+
 def rendered(folder: Path, **options) -> Path:
-    """A dataset of a tube with folds that hide each other."""
-    twin = tube_twin.fitted(tube_twin.seen(tube_twin.surface(fold_mm=3.0)))
+    """A dataset of it."""
     trajectory = Trajectory(poses(), np.arange(FRAMES) / 30, "three poses")
-    options = {"labels": parse_labels("all"), "camera": tube_twin.CAMERA.scaled(2)} | options
-    synthesize(twin, trajectory, folder, **options)
+    options = {"labels": parse_labels("all"), "camera": CAMERA} | options
+    synthesize(twin(), trajectory, folder, **options)
     return folder
 
 
@@ -50,7 +58,7 @@ def test_every_claim_holds_of_every_layout(layout, tmp_path):
 
 @pytest.mark.parametrize("label", parse_labels("all"))
 def test_a_label_alone_proves_what_it_can_and_breaks_nothing(label, tmp_path):
-    proof = prove(rendered(tmp_path / "d", labels=(label,)))
+    proof = prove(rendered(tmp_path / "d", labels=(label,), camera=tube_twin.CAMERA))
     assert proof.holds, proof.broken
 
 
@@ -75,7 +83,7 @@ def in_world(normals: np.ndarray) -> np.ndarray:
 WRONG = {
     "depth is along the ray": (
         "depth_exr",
-        lambda z: z / tube_twin.CAMERA.scaled(2).pixel_directions[..., 2],
+        lambda z: z / CAMERA.pixel_directions[..., 2],
         "flow",
     ),
     "depth is off by 1 %": ("depth", lambda z: z * 1.01, "codes"),
@@ -135,7 +143,7 @@ def test_the_command_prints_the_table_and_its_exit_code_tells(dataset, tmp_path,
     out = capsys.readouterr().out
     assert "The labels agree" in out and "0.05 px" in out
     shutil.copytree(dataset, tmp_path / "d")
-    cv2.imwrite(str(tmp_path / "d" / "0000_mask.png"), np.zeros((144, 192), np.uint8))
+    cv2.imwrite(str(tmp_path / "d" / "0000_mask.png"), np.zeros((CAMERA.height, CAMERA.width), np.uint8))
     assert invoke("check", tmp_path / "d", "--labels", "--json") == 1
     found = json.loads(capsys.readouterr().out)
     assert not found["holds"] and [c["claim"] for c in found["claims"] if not c["holds"]] == ["places"]

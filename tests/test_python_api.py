@@ -1,11 +1,13 @@
 """The library in other hands: what makes sense is taken, and the rest is refused by a typed sentence."""
 
+import io
 import pickle
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 import tube_sequence
 import tube_twin
 
@@ -78,6 +80,13 @@ def test_meshes_of_other_libraries_have_every_vertex_and_every_map(twin, of):
     known = {**twin.materials.per_vertex, "seen_by": surface.seen_by, "nearest_mm": surface.nearest_mm}
     for name, values in known.items():
         np.testing.assert_array_equal(maps[name], values)
+
+
+def test_the_mesh_of_trimesh_can_be_written_with_every_map(twin):
+    written = trimesh.exchange.ply.load_ply(io.BytesIO(twin.to_trimesh().export(file_type="ply")))
+    rows = written["metadata"]["_ply_raw"]["vertex"]["data"]
+    for name in ("roughness", "seen_by", "filled"):
+        np.testing.assert_array_equal(rows[name], twin.to_trimesh().vertex_attributes[name])
 
 
 def test_a_twin_that_has_been_rendered_can_go_to_another_process(twin):

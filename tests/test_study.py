@@ -15,6 +15,7 @@ import tifffile
 import tube_sequence
 from command_line import invoke
 from endotwin.cli import console
+from faults import killed_at_every_operation
 
 import endotwin
 from endotwin.errors import OptionError, OutputError, TwinError
@@ -261,6 +262,22 @@ def test_kept_frames_are_read_again_unless_something_else_is_asked(other, tmp_pa
     with pytest.raises(OptionError, match="b has no depth"):
         kept(iter(blind), 2, size, tmp_path / "f", {"source": "b"})
     assert len(frames.some(2)) == 2 and len(frames.some(9)) == 3
+
+
+def test_frames_that_were_being_kept_when_the_run_was_killed_are_made_again(tmp_path):
+    image = np.arange(36, dtype=np.uint8).reshape(3, 4, 3)
+    frames = [(image + shift, np.full((3, 4), 9.0 + shift)) for shift in range(2)]
+
+    def work() -> None:
+        kept(iter(frames), 2, (4, 3), tmp_path / "f", {"source": "a"})
+
+    def look() -> None:
+        again = kept(iter(frames), 2, (4, 3), tmp_path / "f", {"source": "a"})
+        assert all(np.array_equal(again[index][0], color) for index, (color, _) in enumerate(frames))
+        assert all(np.array_equal(again[index][1], depth_mm) for index, (_, depth_mm) in enumerate(frames))
+        shutil.rmtree(tmp_path / "f")
+
+    assert killed_at_every_operation(work, look) >= 15
 
 
 def test_recipes_are_ranges_that_synth_understands_and_all_has_every_one(made, tmp_path):

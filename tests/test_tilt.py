@@ -22,9 +22,9 @@ DISTURBED_DEG = 1.0
 
 
 @pytest.fixture(scope="module")
-def meshed(example) -> endotwin.Twin:
+def meshed(fused) -> endotwin.Twin:
     """The unfitted twin of the bundled example at half its size."""
-    return endotwin.fuse_twin(example, scale=0.5)
+    return fused(0.5)
 
 
 @pytest.fixture(scope="module")

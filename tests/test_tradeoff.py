@@ -171,7 +171,7 @@ class Interrupted(BaseException):
 def made(tmp_path_factory) -> tuple[Path, list[dict], int]:
     """Two rungs and an effect, stopped in the second and run again: folder, rows, count of measurements."""
     work = tmp_path_factory.mktemp("tradeoff")
-    tube = tube_sequence.write(work / "tube", frames=9)
+    tube = tube_sequence.write(work / "tube", 9, 48, 36)
     rungs, calls, measured = ladder("steps=0,voxel=3+steps=0", "1s"), [], run.measured
 
     def stopped_once(*arguments):

@@ -232,9 +232,17 @@ def move_folder(new: Path, path: Path, own: Callable[[Path], bool]) -> None:
                 raise
 
 
+def copy_folder(path: Path, copy: Path) -> None:
+    """Make ``copy``, which is not there, of the folder ``path``: whole or not at all."""
+    with _workplace(Path(copy).absolute().parent) as work:
+        shutil.copytree(path, work / "copy")
+        (work / "copy").rename(copy)
+
+
 def goes_on(work: Path, mark: str, asked: dict, another: str) -> bool:
     """Whether the folder ``work`` holds what a run has done so far that ``asked`` the same, as its file
-    ``mark`` says. A folder whose place another has taken is removed.
+    ``mark`` says. What that was writing when it was killed is swept; a folder whose place another has taken
+    is removed.
 
     Raises:
         OutputError: it holds the results of ``another`` run.
@@ -245,6 +253,8 @@ def goes_on(work: Path, mark: str, asked: dict, another: str) -> bool:
         return False
     if json.loads((work / mark).read_text(encoding="utf-8")) != asked:
         raise OutputError(f"{work} holds the results of {another}; delete it or choose another -o")
+    for folder in {left.parent for left in work.rglob(f"{HIDDEN}*/")}:
+        sweep(folder)
     return True
 
 

@@ -14,6 +14,7 @@ import numpy as np
 
 from endotwin.errors import OptionError
 from endotwin.run.ahead import ahead
+from endotwin.run.output import whole_file
 from endotwin.run.threads import THREADS
 from endotwin.sequence import Sequence
 from endotwin.sequence.sequence import resized_depth
@@ -125,7 +126,8 @@ def kept(frames: Iterator[Frame], count: int, size: Size, folder: Path, asked: d
             for color, depth_mm in frames:
                 colors.write(color.astype(np.uint8).tobytes())
                 depths.write(depth_mm.astype(np.float16).tobytes())
-        (folder / ASKED).write_text(json.dumps(asked), encoding="utf-8")
+        with whole_file(folder / ASKED) as file:
+            file.write_text(json.dumps(asked), encoding="utf-8")
     color, depth_mm = (np.load(folder / name, mmap_mode="r") for name in (COLOR, DEPTH))
     if not (depth_mm <= FARTHEST_MM).any():
         raise OptionError(f"{asked['source']} has no depth within {FARTHEST_MM:g} mm; leave it out")

@@ -23,6 +23,7 @@ from endotwin.run.output import (
     STUDY,
     check_apart,
     check_free,
+    copy_folder,
     goes_on,
     move_folder,
     unwritable,
@@ -193,7 +194,7 @@ class _Experiment:
             and done.exists()
             and _read(done) == asked
         ):
-            shutil.copytree(self.out, self.work)  # more parts are wanted
+            copy_folder(self.out, self.work)  # more parts are wanted
         for folder in ("results", "networks", "recipes", "datasets", "frames"):
             (self.work / folder).mkdir(parents=True, exist_ok=True)
         _keep(asked, self.work / STUDY)

@@ -55,7 +55,10 @@ def to_trimesh(twin: Twin) -> trimesh.Trimesh:
         twin.surface.triangles,
         vertex_normals=twin.surface.normals,
         vertex_colors=display_color(twin),
-        vertex_attributes=vertex_attributes(twin),
+        vertex_attributes={
+            name: values.astype(np.uint8) if values.dtype == bool else values  # PLY has no bool
+            for name, values in vertex_attributes(twin).items()
+        },
         process=False,
     )
     mesh.units = "mm"

@@ -67,6 +67,7 @@ def test_pictures_reach_the_target_and_a_change_is_followed_late(twin, tmp_path)
     assert (np.diff(left) < 0).all() and 0.5 < left[0] < 1 and left[-1] < 0.1
 
 
+@pytest.mark.slow
 def test_it_is_the_same_with_two_workers_and_the_labels_hold(twin, tmp_path):
     one, two = tmp_path / "one", tmp_path / "two"
     rendered(twin, one), rendered(twin, two, workers=2)

@@ -17,6 +17,8 @@ WIDTH, HEIGHT, FRAMES = 16, 12, 3
 CAMERA = {"model": "pinhole", "width": WIDTH, "height": HEIGHT, "fx": 10, "fy": 10, "cx": 7.5, "cy": 5.5}
 ROTATION_AND_PLACE = np.eye(4)
 SIMCOL_SIZE = 475
+HEAD = 200
+"""Bytes at the beginning of a file, which say what it is."""
 
 ODD_NUMBERS = ["nan", "inf", "-inf", "1e400", "-0", "9" * 400, "1e308", "x", "", "0x10", "1_0", "½", "-1"]
 ODD_VALUES = [
@@ -130,6 +132,22 @@ def write_c3vd_v2_npz(folder: Path) -> Path:
     return folder
 
 
+def write_c3vd_float(folder: Path) -> Path:
+    write_c3vd(folder)
+    for index in range(FRAMES):
+        tifffile.imwrite(folder / f"{index:04d}_depth.tiff", np.full((HEIGHT, WIDTH), 14.0, np.float32))
+    return folder
+
+
+def write_transforms_split(folder: Path) -> Path:
+    write_transforms(folder)
+    content = json.loads((folder / "transforms.json").read_text())
+    (folder / "transforms.json").unlink()
+    for name, frames in (("train", content["frames"][1:]), ("test", content["frames"][:1])):
+        (folder / f"transforms_{name}.json").write_text(json.dumps({**content, "frames": frames}))
+    return folder
+
+
 def write_simcol(folder: Path) -> Path:
     size = (SIMCOL_SIZE, SIMCOL_SIZE)
     _photo(folder / "FrameBuffer_0000.png", 0, size)
@@ -159,11 +177,13 @@ WRITERS: dict[str, Callable[[Path], Path]] = {
     for writer in (
         write_c3vd,
         write_c3vd_exr,
+        write_c3vd_float,
         write_c3vd_v2,
         write_c3vd_v2_npz,
         write_transforms,
         write_transforms_masked,
         write_transforms_npy,
+        write_transforms_split,
         write_simcol,
         write_tum,
     )
@@ -200,7 +220,8 @@ def damaged(draw: st.DrawFn, contents: dict[Path, bytes]) -> tuple[Path, bytes]:
     if kind == "flip":
         spoilt = bytearray(content)
         for _ in range(draw(st.integers(1, 4))):
-            spoilt[draw(st.integers(0, len(spoilt) - 1))] ^= 1 << draw(st.integers(0, 7))
+            end = min(len(spoilt), draw(st.sampled_from([HEAD, len(spoilt)])))
+            spoilt[draw(st.integers(0, end - 1))] ^= 1 << draw(st.integers(0, 7))
         return path, bytes(spoilt)
     if kind == "swap":
         return path, contents[draw(st.sampled_from(sorted(contents)))]

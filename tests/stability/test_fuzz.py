@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 import tube_sequence
 import tube_twin
 from command_line import invoke
@@ -229,6 +230,37 @@ YAML = st.one_of(
         max_leaves=8,
     ).map(lambda value: json.dumps(value, ensure_ascii=False)),
 )
+
+
+@pytest.fixture(scope="module")
+def painted(made) -> Files:
+    """Files that say which vertices belong to a region, and the ranges that name each."""
+    folder = made / "painted"
+    folder.mkdir()
+    weight = np.linspace(0, 1, len(TWIN.surface.vertices_mm))
+    np.save(folder / "weight.npy", weight)
+    mesh = trimesh.creation.box()
+    mesh.visual.vertex_colors = np.uint8(30 * np.arange(8))[:, None].repeat(4, axis=1)
+    mesh.export(folder / "weight.ply")
+    for suffix in (".npy", ".ply"):
+        region = {"name": "polyp", "vertices": f"weight{suffix}", "material": ["roughness*1.2"]}
+        (folder / f"ranges{suffix}.json").write_text(json.dumps({"regions": [region]}))
+        read_variation(folder / f"ranges{suffix}.json", TWIN, Variation())
+    return files_of(folder)
+
+
+@FEW
+@given(data=st.data())
+def test_damaged_files_of_a_region_are_read_or_told_in_one_sentence(made, painted, data):
+    path, spoilt = data.draw(damaged(painted))
+    path.write_bytes(spoilt)
+    try:
+        for suffix in (".npy", ".ply"):
+            read_variation(made / "painted" / f"ranges{suffix}.json", TWIN, Variation())
+    except EndotwinError as error:
+        assert str(error) and "\n" not in str(error)
+    finally:
+        path.write_bytes(painted[path])
 
 
 @settings(FEW, max_examples=100)

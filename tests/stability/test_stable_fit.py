@@ -35,19 +35,19 @@ def bits(twin: Twin) -> tuple:
     return tuple(maps[name].tobytes() for name in maps), twin.light, twin.response, twin.materials.f0
 
 
-def test_few_pixels_drawn_with_other_seeds_agree_within_three_tenths_of_a_decibel(example):
+def test_few_pixels_drawn_with_other_seeds_agree_within_three_tenths_of_a_decibel(fused):
     """The bundled example at half its size; half of its pixels are looked at, an eighth for the light."""
-    fused = endotwin.fuse_twin(example, scale=0.5)
+    half = fused(0.5)
     few = FitConfig(pixels=200_000)
-    findings = list(spread([endotwin.fit_twin(fused, seed=seed, config=few) for seed in range(2)], 0.3, 3))
+    findings = list(spread([endotwin.fit_twin(half, seed=seed, config=few) for seed in range(2)], 0.3, 3))
     assert all(finding.ok for finding in findings), findings
 
 
 @pytest.mark.skipif("ENDOTWIN_SLOW" not in os.environ, reason="ENDOTWIN_SLOW is not set: it takes minutes")
-def test_twenty_seeds_agree_within_three_tenths_of_a_decibel_and_one_percent_of_gamma(example):
+def test_twenty_seeds_agree_within_three_tenths_of_a_decibel_and_one_percent_of_gamma(fused):
     """The bundled example as it is."""
-    fused = endotwin.fuse_twin(example)
-    findings = list(spread([endotwin.fit_twin(fused, seed=seed) for seed in range(20)], 0.3, 1))
+    whole = fused()
+    findings = list(spread([endotwin.fit_twin(whole, seed=seed) for seed in range(20)], 0.3, 1))
     assert all(finding.ok for finding in findings), findings
 
 

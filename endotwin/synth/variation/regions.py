@@ -74,7 +74,7 @@ def _painted(file: Path, surface: Surface) -> np.ndarray:
         colors = np.asarray(mesh.visual.vertex_colors)[:, :3].mean(axis=1) / 255
         nearest = cKDTree(mesh.vertices).query(surface.vertices_mm + surface.origin_mm)[1]
         return colors[nearest]
-    except (OSError, ValueError, AttributeError, IndexError) as error:
+    except Exception as error:  # these libraries raise whatever the wrong bytes lead them to
         raise OptionError(
             f"{file} is no vertex mask ({error}); give a .npy of one number a vertex, or a .ply of the "
             f"surface "
