@@ -12,7 +12,7 @@ from command_line import invoke
 
 from endotwin.errors import SequenceError
 from endotwin.sequence.images import read_color
-from endotwin.synth import LAYOUTS, Trajectory, parse_labels, prove, synthesize
+from endotwin.synth import LAYOUTS, Trajectory, parse_labels, prove, synthesize, with_polyps
 from endotwin.synth.encodings import ENCODINGS
 from endotwin.synth.proof import CLAIMS, Written
 
@@ -27,10 +27,11 @@ def poses() -> np.ndarray:
 
 
 def rendered(folder: Path, **options) -> Path:
-    """A dataset of a tube with folds that hide each other."""
-    twin = tube_twin.fitted(tube_twin.seen(tube_twin.surface(fold_mm=3.0)))
+    """A dataset of a tube with folds that hide each other, and a polyp."""
     trajectory = Trajectory(poses(), np.arange(FRAMES) / 30, "three poses")
-    options = {"labels": parse_labels("all"), "camera": tube_twin.CAMERA.scaled(2)} | options
+    twin = tube_twin.fitted(tube_twin.seen(tube_twin.surface(fold_mm=3.0)))
+    twin, _ = with_polyps(twin, "Is:size=4", 0, trajectory)
+    options = {"labels": parse_labels("all", polyps=True), "camera": tube_twin.CAMERA.scaled(2)} | options
     synthesize(twin, trajectory, folder, **options)
     return folder
 
@@ -48,7 +49,7 @@ def test_every_claim_holds_of_every_layout(layout, tmp_path):
     assert all(row.pixels > 100 for row in proof.rows)
 
 
-@pytest.mark.parametrize("label", parse_labels("all"))
+@pytest.mark.parametrize("label", parse_labels("all", polyps=True))
 def test_a_label_alone_proves_what_it_can_and_breaks_nothing(label, tmp_path):
     proof = prove(rendered(tmp_path / "d", labels=(label,)))
     assert proof.holds, proof.broken
@@ -92,6 +93,8 @@ WRONG = {
     "base colour is mirrored": ("albedo", lambda albedo: albedo[:, ::-1].copy(), "materials"),
     "rgb has other channels first": ("rgb", swapped, "split"),
     "linear is not": ("rgb_linear", np.sqrt, "codes"),
+    "a polyp has another number": ("polyp", lambda ids: 2 * ids, "polyps"),
+    "polyps are a pixel lower": ("polyp", lambda ids: np.roll(ids, 1, axis=0), "polyps"),
     "highlights are everywhere": ("highlights", lambda mask: np.full_like(mask, 255), "places"),
 }
 
