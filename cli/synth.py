@@ -15,7 +15,7 @@ from endotwin.run.output import DATASET, check_apart, check_free, check_picture
 LABELS = (
     "rgb, rgb_linear, rgb_exr, depth, depth_exr, normals, mask, albedo, roughness, metallic, diffuse, "
     "specular, flow, flow_forward, flow_exr, flow_npz, flow_forward_exr, flow_forward_npz, occlusion, "
-    "triangles, overlay; of motion scene_flow, scene_flow_forward, vertices; 'all'"
+    "triangles, overlay; of polyps polyp; of motion scene_flow, scene_flow_forward, vertices; 'all'"
 )
 
 
@@ -35,8 +35,13 @@ def synth(
         typer.Option("-o", "--output", metavar="DATASET", show_default=False, help="Folder for the dataset."),
     ] = None,
     labels: Annotated[
-        str, typer.Option(metavar="NAMES", help=f"What to write, joined by commas: {LABELS}.")
-    ] = "rgb,depth,normals,mask",
+        str | None,
+        typer.Option(
+            metavar="NAMES",
+            help=f"What to write, joined by commas: {LABELS}.",
+            show_default="rgb,depth,normals,mask, and polyp where some grow",
+        ),
+    ] = None,
     layout: Annotated[
         str,
         typer.Option(metavar="NAME", help="c3vd, c3vd2, transforms, tum, simcol, flat or webdataset."),
@@ -80,6 +85,15 @@ def synth(
             metavar="KIND:…",
             help="Let the tissue move: 'peristalsis:amplitude=…,width=…,speed=…,delay=…,pulse=…' or "
             "'breathing:amplitude=…,period=…,follow=…'; may be repeated.",
+        ),
+    ] = None,
+    polyp: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="CLASS:…",
+            help="Grow polyps on the wall, of the Paris classes Ip (on a stalk), Is (sessile) or IIa (flat): "
+            "'Is:size=6,height=…,count=3,ihb=…', at random where the trajectory sees the wall, or at "
+            "'x=…,y=…,z=…' or 'frame=…,u=…,v=…'; may be repeated.",
         ),
     ] = None,
     clearance: Annotated[
@@ -137,7 +151,11 @@ def synth(
             twin = Twin.load(twin_folder)
         limits = Limits(clearance, max_unseen, float("inf") if max_distance is None else max_distance)
         choices = {"material": material or (), "light": light or (), "vary": vary, "camera": camera}
-        choices |= {"effects": parse_states(effects, like=True), "motion": motion or ()}
+        choices |= {
+            "effects": parse_states(effects, like=True),
+            "motion": motion or (),
+            "polyps": polyp or (),
+        }
         choices |= {"limits": limits, "seed": seed, "overwrite": overwrite}
         with run.stage("synth"):
             if preview:

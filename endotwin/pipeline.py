@@ -178,6 +178,7 @@ def synthesize(
     camera: Path | str | None = None,
     effects: Mapping[str, str] | None = None,
     motion: Iterable[str] | str = (),
+    polyps: Iterable[str] | str = (),
     labels: Iterable[str] | str | None = None,
     layout: str = "c3vd",
     limits: Limits | None = None,
@@ -201,6 +202,8 @@ def synthesize(
             or in that whose path stands under the name ``like``.
         motion: of the tissue, such as ``peristalsis:amplitude=1`` or ``breathing``, one or several (see
             ``endotwin.synth.parse_motion``).
+        polyps: that grow on the wall, such as ``Is:size=6,count=3`` or ``Ip:size=10``, one or several; places
+            that are not given are drawn where the trajectory sees the wall.
         labels: names such as ``rgb,depth`` (see ``endotwin.synth.LABELS``), or ``all``.
         layout: one of ``endotwin.synth.LAYOUTS``.
         limits: what a pose must keep to be rendered.
@@ -217,8 +220,38 @@ def synthesize(
     """
     from endotwin.synth import render_dataset
 
-    job = _job(twin, trajectory, material, light, vary, camera, effects, motion, labels, layout, limits, seed)
+    wanted = (motion, polyps, labels, layout, limits, seed)
+    job = _job(twin, trajectory, material, light, vary, camera, effects, *wanted)
     return render_dataset(job, out, workers, scheduler, overwrite, progress)
+
+
+def with_polyps(
+    twin: Twin | Path | str,
+    polyps: Iterable[str] | str,
+    *,
+    trajectory: str | Path | np.ndarray | None = None,
+    seed: int = 0,
+    limits: Limits | None = None,
+) -> Twin:
+    """A fitted twin with polyps grown on its wall, which can be rendered, saved and exported as any other.
+
+    Args:
+        twin: or its folder.
+        polyps: one such as ``Is:size=6,count=3`` (classes Ip, Is and IIa of the Paris workshop), or several.
+        trajectory: that sees the places which are not given, as of ``synthesize``; without one, they are
+            anywhere on wall that the training photos show.
+        seed: of shapes and places. limits: of the trajectory's poses.
+
+    Raises:
+        TwinError: the twin is not fitted. OptionError: a polyp is not understood, or does not fit in.
+    """
+    from endotwin import synth
+
+    twin = as_twin(twin)
+    poses = None
+    if trajectory is not None:
+        poses = synth.parse_trajectory(trajectory, twin, seed, twin.camera, limits)
+    return synth.with_polyps(twin, polyps, seed, poses)[0]
 
 
 def preview(
@@ -232,6 +265,7 @@ def preview(
     camera: Path | str | None = None,
     effects: Mapping[str, str] | None = None,
     motion: Iterable[str] | str = (),
+    polyps: Iterable[str] | str = (),
     limits: Limits | None = None,
     seed: int = 0,
     overwrite: bool = False,
@@ -243,7 +277,8 @@ def preview(
     """
     from endotwin.look import preview as draw
 
-    job = _job(twin, trajectory, material, light, vary, camera, effects, motion, "rgb", "c3vd", limits, seed)
+    wanted = (motion, polyps, "rgb", "c3vd", limits, seed)
+    job = _job(twin, trajectory, material, light, vary, camera, effects, *wanted)
     return draw.preview(job, out, overwrite)
 
 
@@ -256,6 +291,7 @@ def _job(
     camera: Path | str | None,
     effects: Mapping[str, str] | None,
     motion: Iterable[str] | str,
+    polyps: Iterable[str] | str,
     labels: Iterable[str] | str | None,
     layout: str,
     limits: Limits | None,
@@ -271,10 +307,15 @@ def _job(
     variation = synth.fixed(edits, [synth.parse_light_edit(edit) for edit in light])
     if vary:
         variation = synth.read_variation(Path(vary), twin, variation)
-    chosen = synth.DEFAULT_LABELS
+    grows = bool(polyps or twin.polyps)
+    chosen = (*synth.DEFAULT_LABELS, *(("polyp",) if grows else ()))
     if labels is not None:
-        chosen = synth.parse_labels(labels if isinstance(labels, str) else ",".join(labels), bool(motion))
+        labels = labels if isinstance(labels, str) else ",".join(labels)
+        chosen = synth.parse_labels(labels, bool(motion), grows)
     poses = synth.parse_trajectory(trajectory, twin, seed, lens, limits)
+    if polyps:
+        twin, weights = synth.with_polyps(twin, polyps, seed, poses, lens)
+        variation, poses = variation.carried(weights), synth.kept_in(poses, twin, lens)
     moving = synth.parse_motion(motion, twin)
     if moving:
         poses = moving.carried(poses)

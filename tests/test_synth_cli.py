@@ -13,6 +13,7 @@ from endotwin.cli import console
 from endotwin.cli import synth as command
 from endotwin.cli.main import main
 
+from endotwin.anatomy import CLASSES
 from endotwin.sequence.poses import write_c3vd_poses
 from endotwin.sequence.readers import open_sequence
 from endotwin.synth import DEFAULT_LABELS, LABELS, LAYOUTS
@@ -66,6 +67,18 @@ def test_layout_labels_lens_and_variation_are_as_they_were_asked_for(made, synth
     )
 
 
+def test_polyps_bring_their_label_and_their_table(synth, tmp_path):
+    polyps = ("--polyp", "Is:size=4,count=2", "--polyp", "IIa:size=6")
+    code, _, err = synth(*polyps, "--layout", "flat", "-o", tmp_path / "d")
+    assert code == 0, err
+    document = json.loads((tmp_path / "d" / "dataset.json").read_text())
+    assert document["labels"] == [*DEFAULT_LABELS, "polyp"]
+    assert [(each["number"], each["paris"]) for each in document["polyps"]] == [
+        *((1, "0-Is"), (2, "0-Is"), (3, "0-IIa"))
+    ]
+    assert len(list((tmp_path / "d" / "polyp").iterdir())) == FRAMES
+
+
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_a_stopped_run_says_that_the_same_command_goes_on_and_it_does(
     synth, tmp_path, monkeypatch, number, code
@@ -108,6 +121,10 @@ def test_progress_shows_frames_a_second():
         (["-o", "{new}", "--motion", "breathing:period=0"], "period"),
         (["-o", "{new}", "--labels", "scene_flow"], "--motion"),
         (["-o", "{new}", "--effects", "like=nowhere"], "nowhere"),
+        (["-o", "{new}", "--polyp", "III"], "Ip or Is or IIa"),
+        (["-o", "{new}", "--polyp", "Is:size=25"], "choose a smaller size"),
+        (["-o", "{new}", "--polyp", "Is:x=0,y=0,z=900"], "from the surface"),
+        (["-o", "{new}", "--labels", "polyp"], "--polyp"),
         (["--preview", "{new}.jpg"], "png"),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",
@@ -126,5 +143,6 @@ def test_the_help_names_all_labels_and_layouts():
     assert all(label in command.LABELS for label in LABELS)
     assert all(kind in str(options["motion"]) for kind in KINDS)
     assert all(layout in str(options["layout"]) for layout in LAYOUTS)
+    assert all(kind in str(options["polyp"]) for kind in CLASSES)
     assert command.synth.__kwdefaults__ is None
-    assert ",".join(DEFAULT_LABELS) in [str(value) for value in command.synth.__defaults__]
+    assert ",".join(DEFAULT_LABELS) in str(options["labels"])

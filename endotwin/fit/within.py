@@ -51,7 +51,8 @@ class Sightings:
 
     Attributes:
         vertex, frame: int [S]. residual: ln photo − ln prediction [S]. slopes: d ln C by the shared
-            parameters [S, G]. by_coat: d ln C by the coat's weight [S], 0 without one. weight: inverse variance [S].
+            parameters [S, G]. by_coat: d ln C by the coat's weight [S], 0 without one. weight: inverse
+            variance [S].
     """
 
     vertex: np.ndarray

@@ -4,10 +4,12 @@ from endotwin.synth.job import Job
 from endotwin.synth.labels import DEFAULT_LABELS, LABELS, parse_labels
 from endotwin.synth.layouts import LAYOUTS
 from endotwin.synth.motion import Motion, parse_motion
+from endotwin.synth.polyps import with_polyps
 from endotwin.synth.proof import Proof, prove
 from endotwin.synth.run.dataset import Summary, make_job, render_dataset, synthesize
 from endotwin.synth.trajectories import Trajectory, parse_trajectory
 from endotwin.synth.trajectories.screening import Limits
+from endotwin.synth.trajectories.trajectory import kept_in
 from endotwin.synth.variation import Variation, fixed, read_variation
 from endotwin.synth.variation.edits import Edit, parse_light_edit, parse_material_edit
 from endotwin.synth.variation.switches import equipped
@@ -26,6 +28,7 @@ __all__ = [
     "Variation",
     "equipped",
     "fixed",
+    "kept_in",
     "make_job",
     "parse_labels",
     "parse_light_edit",
@@ -36,4 +39,5 @@ __all__ = [
     "read_variation",
     "render_dataset",
     "synthesize",
+    "with_polyps",
 ]

@@ -333,6 +333,12 @@ ENCODINGS: dict[str, Encoding] = {
         "materials are a guess); 64: filled in (its shape is a guess too); 0: no surface",
         pixels,
     ),
+    "polyp": Encoding(
+        ".png",
+        png,
+        "8-bit: number of the polyp that is seen, counted from 1 (see polyps in dataset.json); 0: none",
+        pixels,
+    ),
     "overlay": Encoding(
         ".png",
         png,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from dataclasses import dataclass, fields
+from dataclasses import asdict, dataclass, fields
 from importlib.metadata import version
 
 import numpy as np
@@ -82,9 +82,10 @@ class Job:
 
 
 def fingerprint(twin: Twin) -> str:
-    """SHA-256 of all that a rendering depends on: surface, materials, camera, light, response, effects."""
+    """SHA-256 of all that frames depend on: surface, materials, camera, light, response, effects, polyps."""
     digest = hashlib.sha256(json.dumps(twin.effects.to_dict(), sort_keys=True).encode())
     parts = (twin.surface, twin.camera, twin.light, twin.response)
+    digest.update(json.dumps([asdict(polyp) for polyp in twin.polyps]).encode() if twin.polyps else b"")
     values = [(field.name, getattr(part, field.name)) for part in parts for field in fields(part)]
     materials = twin.materials.arrays | twin.materials.constants
     for name, value in (*values, *materials.items()):

@@ -20,6 +20,7 @@ from endotwin.synth.flow import flow_to, hides_surface, projected, seen_from
 from endotwin.synth.job import Job
 from endotwin.synth.motion import Body
 from endotwin.synth.photograph import photographed
+from endotwin.twin.polyps import numbered
 
 MASK_NONE, MASK_FILLED, MASK_UNSEEN, MASK_VALID = 0, 64, 128, 255
 HIDDEN_NONE, HIDDEN_NO, HIDDEN_YES = 128, 0, 255
@@ -45,6 +46,7 @@ LABELS: dict[str, tuple[str, ...]] = {
     "flow_forward_npz": ("flow_forward_npz", "flow_forward_hidden"),
     "occlusion": ("occlusion",),
     "triangles": ("triangles",),
+    "polyp": ("polyp",),
     "overlay": ("overlay",),
     "scene_flow": ("scene_flow",),
     "scene_flow_forward": ("scene_flow_forward",),
@@ -54,6 +56,9 @@ LABELS: dict[str, tuple[str, ...]] = {
 
 OF_MOTION = ("scene_flow", "scene_flow_forward", "vertices")
 """Labels that only tissue which moves by itself has."""
+
+OF_POLYPS = ("polyp",)
+"""Labels that only a twin with polyps has."""
 
 DEFAULT_LABELS = ("rgb", "depth", "normals", "mask")
 
@@ -72,14 +77,15 @@ SHADED = PHOTOS | SPLIT | {"albedo", "roughness", "metallic", "overlay"}
 """Labels that need a photo, those of its parts, and all that need the frame's draw."""
 
 
-def parse_labels(text: str, moving: bool = False) -> tuple[str, ...]:
+def parse_labels(text: str, moving: bool = False, polyps: bool = False) -> tuple[str, ...]:
     """Names of labels from ``rgb,depth,…`` or ``all``, in their own order; raises OptionError.
 
-    ``all`` is those that tissue has which is ``moving`` by itself, or is not.
+    ``all`` is those of tissue that is ``moving`` by itself, or is not, and has ``polyps``, or has none.
     """
     names = [name.strip() for name in text.split(",") if name.strip()]
     if names == ["all"]:
-        return tuple(name for name in LABELS if moving or name not in OF_MOTION)
+        missing = {*(() if moving else OF_MOTION), *(() if polyps else OF_POLYPS)}
+        return tuple(name for name in LABELS if name not in missing)
     unknown = [name for name in names if name not in LABELS]
     if unknown or not names:
         raise OptionError(
@@ -104,6 +110,7 @@ class Labeller:
         self._job = job
         self._body = Body(job.twin.surface, job.motion, job.trajectory.timestamps_s)
         self._kinds = triangle_kinds(job.twin.surface)
+        self._polyps = numbered((each.triangles for each in job.twin.polyps), len(job.twin.surface.triangles))
         self._T_world_next = following(job.trajectory.T_world_camera)
         self._shaded: tuple[object, Renderer, Renderer | None] | None = None
 
@@ -133,7 +140,7 @@ class Labeller:
                 images["highlights"] = np.uint8(255) * (red & green & blue)
             view = view or matt
         hits = view.hits if view else self._body.at(index).cast(job.camera, T_world_camera)
-        geometry = _Geometry(job, self._body, hits, index, self._kinds, renderer, view)
+        geometry = _Geometry(job, self._body, hits, index, self._kinds, self._polyps, renderer, view)
         for name in job.images:
             if name not in images:
                 images[name] = getattr(geometry, name)
@@ -174,6 +181,7 @@ class _Geometry:
         hits: Correspondences,
         index: int,
         kinds: np.ndarray,
+        polyps: np.ndarray,
         renderer: Renderer | None,
         view: View | None,
     ):
@@ -181,7 +189,7 @@ class _Geometry:
         self._caster = body.at(index)
         self._others: dict[int, np.ndarray] = {}
         self._places: dict[int, np.ndarray] = {}
-        self._kinds, self._renderer, self._view = kinds, renderer, view
+        self._kinds, self._polyps, self._renderer, self._view = kinds, polyps, renderer, view
         self._T_world_camera = job.trajectory.T_world_camera[index]
 
     def _image(self, values: np.ndarray, empty: float = 0.0) -> np.ndarray:
@@ -230,6 +238,10 @@ class _Geometry:
     @property
     def triangles(self) -> np.ndarray:
         return self._image(self._hits.triangle, -1)
+
+    @property
+    def polyp(self) -> np.ndarray:
+        return self._image(self._polyps[self._hits.triangle])
 
     @property
     def overlay(self) -> np.ndarray:

@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from endotwin.twin.polyps import MOST_POLYPS
+
 if TYPE_CHECKING:
     from endotwin.light.film import Film
     from endotwin.twin.twin import Twin
@@ -51,6 +53,8 @@ def require_sound(twin: Twin) -> Twin:
     _require("the record", isinstance(twin.record, dict))
     fitted = [part is not None for part in (twin.materials, twin.light, twin.response)]
     _require("the fit", all(fitted) or not any(fitted))
+    ends = [0, *(end for polyp in twin.polyps for end in np.cumsum(polyp.triangles)), len(triangles)]
+    _require("the place of a polyp", ends == sorted(ends) and len(twin.polyps) <= MOST_POLYPS)
     if all(fitted):
         _require_fit(twin, count)
     return twin

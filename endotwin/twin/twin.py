@@ -26,6 +26,7 @@ from endotwin.sequence import Sequence, Split
 from endotwin.sequence.readers import open_sequence
 from endotwin.surface import Surface
 from endotwin.twin import meshes
+from endotwin.twin.polyps import Polyp
 from endotwin.twin.registration import Registration
 from endotwin.twin.soundness import require_sound
 
@@ -173,6 +174,7 @@ class Twin:
         record: how the twin was made: options, seconds of each stage, scores.
         effects: what it has beside the paper's light and materials. decisions: why, by name of the effect.
         registration: corrections of the photos' poses; None: they are where the sequence says.
+        polyps: that were grown on the surface.
     """
 
     surface: Surface
@@ -185,6 +187,7 @@ class Twin:
     effects: Effects = field(default_factory=Effects)
     decisions: dict[str, Decision] = field(default_factory=dict)
     registration: Registration | None = None
+    polyps: tuple[Polyp, ...] = ()
 
     @property
     def fitted(self) -> bool:
@@ -208,6 +211,10 @@ class Twin:
             ]
         else:
             lines.append("not fitted")
+        if self.polyps:
+            lines.append(
+                f"polyps: {', '.join(f'{each.kind} of {each.size_mm:.1f} mm' for each in self.polyps)}"
+            )
         scores = self.record.get("eval")
         if scores and scores.get("psnr") is not None:
             lines.append(f"held out: {scores['psnr']:.2f} dB, SSIM {scores['ssim']:.4f}")
@@ -321,6 +328,8 @@ class Twin:
         }
         if self.registration is not None:
             document["registration"] = self.registration.to_dict()
+        if self.polyps:
+            document["polyps"] = [asdict(polyp) for polyp in self.polyps]
         return {**document, "seal": _seal(document)}
 
     @classmethod
@@ -349,6 +358,7 @@ class Twin:
                 registration=Registration.from_dict(moved)
                 if (moved := document.get("registration"))
                 else None,
+                polyps=tuple(map(Polyp.from_dict, document.get("polyps", ()))),
             )
             return require_sound(twin)
         except FileNotFoundError as error:

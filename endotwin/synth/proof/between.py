@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from endotwin.synth.flow import OCCLUSION_RANGE_MM
-from endotwin.synth.proof.warp import Frame, Landing, landing, sampled
+from endotwin.synth.proof.warp import Frame, Landing, Sampled, landing, sampled
 from endotwin.synth.proof.within import FLOWS, Judged
 
 SEEN, HIDDEN = 0, 255
@@ -34,6 +34,8 @@ def between(one: Frame, other: Frame) -> Iterator[Judged]:
         hidden = one.first(f"{name}_hidden")
         yield from _depths(other, there, None if hidden is None else hidden.ravel()[there.chosen])
         yield from _materials(one, other, there)
+        if written.has("polyp"):
+            yield "polyps", _polyps(one, other, there)
     if flow_px is not None and back_px is not None and other.distance_mm is not None:
         yield "cycle", _cycle(one, other, name, flow_px, back_px)
 
@@ -68,16 +70,30 @@ def _depths(other: Frame, there: Landing, hidden: np.ndarray | None) -> Iterator
         yield "occlusion", (about.values(other.image("occlusion")) == 0).all(axis=1)[behind].astype(float)
 
 
+def _same_tissue(other: Frame, there: Landing) -> Sampled:
+    """Where points land on smooth surface of the other frame, and on it."""
+    about = sampled(other, there.uv)
+    about = about.where(about.values(other.smooth).all(axis=1))
+    lies = np.abs(about.mean(other.distance_mm) - there.distance_mm[about.chosen]) < BEHIND_MM / 5
+    return about.where(lies)
+
+
+def _polyps(one: Frame, other: Frame, there: Landing) -> np.ndarray:
+    """Whether the tissue of a polyp is of another there, or of none, where all about it is of one."""
+    about = _same_tissue(other, there)
+    four = about.values(other.image("polyp"))
+    here = one.image("polyp").ravel()[there.chosen[about.chosen]]
+    told = (four == four[:, :1]).all(axis=1) & ((four[:, 0] > 0) | (here > 0))
+    return (four[:, 0] != here)[told].astype(float)
+
+
 def _materials(one: Frame, other: Frame, there: Landing) -> Iterator[Judged]:
     """Whether the tissue has the materials there that it has here."""
     same = ("material", "regions")
     here_drawn, there_drawn = (each.written.records[each.index] for each in (one, other))
     if any(here_drawn.get(key) != there_drawn.get(key) for key in same):
         return
-    about = sampled(other, there.uv)
-    about = about.where(about.values(other.smooth).all(axis=1))
-    lies = np.abs(about.mean(other.distance_mm) - there.distance_mm[about.chosen]) < BEHIND_MM / 5
-    about = about.where(lies)
+    about = _same_tissue(other, there)
     for name in filter(one.written.has, MATERIALS):
         here = one.image(name).reshape(len(one.distance_mm.ravel()), -1)[there.chosen[about.chosen]]
         off = np.abs(about.mean(other.image(name)).reshape(here.shape) - here)

@@ -11,6 +11,7 @@ from endotwin.effects import RENDERED
 from endotwin.surface.vectors import dot, unit
 from endotwin.synth.photograph import RECORDING
 from endotwin.synth.proof.warp import DEPTHS, Frame
+from endotwin.twin.polyps import numbered
 
 Judged = tuple[str, np.ndarray]
 """The name of a claim, and the errors of the pixels that were judged by it."""
@@ -43,6 +44,9 @@ def within(frame: Frame) -> Iterator[Judged]:
     placed = not frame.written.moving or frame.written.has("vertices")
     if frame.written.has("triangles") and frame.distance_mm is not None and placed:
         yield "triangles", _triangles(frame)
+    if frame.written.has("triangles", "polyp"):
+        told, named = frame.image("polyp"), _named(frame)
+        yield "polyps", (told != named)[(told > 0) | (named > 0)].astype(float)
     yield from _colors(frame)
 
 
@@ -76,6 +80,7 @@ def _places(frame: Frame) -> Iterator[Judged]:
         ("albedo", lambda x: x.any(axis=-1)),
         ("roughness", np.bool_),
         ("occlusion", np.bool_),
+        ("polyp", np.bool_),
     ):
         if has(name):
             wrong |= told(frame.image(name)) & ~there
@@ -142,6 +147,14 @@ def _triangles(frame: Frame) -> np.ndarray:
     facing = unit(np.cross(b - a, c - a))
     off = np.abs(dot(points - a, facing)) - frame.half_step_mm(chosen) * np.abs(dot(rays, facing))
     return np.maximum(off, 0)
+
+
+def _named(frame: Frame) -> np.ndarray:
+    """Numbers [H, W] of the polyps to which ``dataset.json`` counts the triangles that are named."""
+    polyps = frame.written.document["polyps"]
+    numbers = numbered((each["triangles"] for each in polyps), len(frame.written.surface[1]))
+    triangle = frame.image("triangles")
+    return np.where(triangle >= 0, numbers[triangle], 0)
 
 
 def _colors(frame: Frame) -> Iterator[Judged]:

@@ -146,6 +146,8 @@ def make_job(
     still = [label for label in labels if motion is None and label in OF_MOTION]
     if still:
         raise OptionError(f"the label {still[0]} needs tissue that moves; ask for motion too (--motion)")
+    if "polyp" in labels and not twin.polyps:
+        raise OptionError("the label polyp needs polyps; ask for some too (--polyp)")
     refusal = LAYOUTS[layout].refusal(camera, labels)
     if refusal:
         raise OptionError(f"layout {layout}: {refusal}")

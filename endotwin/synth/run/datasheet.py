@@ -37,6 +37,7 @@ def write_datasheet(path: Path, document: dict, statistics: Statistics, proof: P
         _table("Limits of the poses", document["limits"]),
         _table("Variation", _flat(document["variation"])),
         _table("Motion", _flat(document.get("motion", {}))),
+        _table("Polyps", dict(map(_polyp, document.get("polyps", ())))),
         _table("Twin", _flat(document["twin"])),
         _table("Camera", document["camera"]),
         _table("Conventions", document["conventions"]),
@@ -49,6 +50,15 @@ def write_datasheet(path: Path, document: dict, statistics: Statistics, proof: P
         head + "\n".join(section for section in sections if section) + "\n",
         encoding="utf-8",
         errors="backslashreplace",
+    )
+
+
+def _polyp(polyp: dict) -> tuple[str, str]:
+    """Number and description of a polyp."""
+    x, y, z = polyp["place_mm"]
+    return str(polyp["number"]), (
+        f"{polyp['paris']}, {polyp['size_mm']:.1f} mm wide, {polyp['height_mm']:.1f} mm high, at "
+        f"({x:.1f}, {y:.1f}, {z:.1f}) mm"
     )
 
 

@@ -48,6 +48,7 @@ def describe(
     """
     chosen = LAYOUTS[layout]
     moving = {} if motion is None else {"motion": motion.to_dict()}
+    standing = {"polyps": _table(twin)} if twin.polyps else {}
     words = {image: chosen.encoding(image).words for label in labels for image in LABELS[label]}
     return {
         "format": layout,
@@ -65,6 +66,7 @@ def describe(
         },
         "variation": variation.to_dict(),
         **moving,
+        **standing,
         "camera": camera.to_dict(),
         "twin": {
             "sha256": fingerprint(twin),
@@ -80,6 +82,14 @@ def describe(
         "conventions": {**words, **chosen.words, **COMMON_WORDS},
         "license_note": LICENSE_NOTE,
     }
+
+
+def _table(twin: Twin) -> list[dict]:
+    """The polyps by number, as the label has it."""
+    return [
+        {"number": number, "paris": f"0-{polyp.kind}", **asdict(polyp)}
+        for number, polyp in enumerate(twin.polyps, 1)
+    ]
 
 
 def _finite(values: dict[str, float]) -> dict[str, float | None]:

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from math import isnan, nan
+from typing import Protocol
 
 import numpy as np
 from scipy.spatial import cKDTree
 
-from endotwin.errors import TrajectoryError
+from endotwin.errors import EndotwinError, TrajectoryError
 from endotwin.surface.casting import Caster, surface_points
 from endotwin.surface.vectors import unit
 from endotwin.synth.trajectories.flight import posed, untwisted
@@ -37,7 +38,7 @@ def orbit(options: OrbitOptions, twin: Twin) -> tuple[np.ndarray, str]:
         TrajectoryError: no point is given, or there is none at that pixel. SequenceError: the sequence of
             ``frame`` is gone.
     """
-    point = _point(options, twin)
+    point = wall_point(options, twin, "orbit", TrajectoryError)
     surface = twin.surface
     nearest = cKDTree(surface.vertices_mm).query(point - surface.origin_mm)[1]
     normal = surface.normals[nearest].astype(np.float64)
@@ -52,26 +53,39 @@ def orbit(options: OrbitOptions, twin: Twin) -> tuple[np.ndarray, str]:
     return posed(untwisted(places, -away), places), description
 
 
-def _point(options: OrbitOptions, twin: Twin) -> np.ndarray:
-    """The point of the options, float64 [3], world mm."""
+class Point(Protocol):
+    """Options that tell a point of the wall: where it lies, or the pixel of a frame that shows it."""
+
+    x: float
+    y: float
+    z: float
+    frame: int
+    u: float
+    v: float
+
+
+def wall_point(options: Point, twin: Twin, what: str, error: type[EndotwinError]) -> np.ndarray:
+    """The point of the options of ``what``, float64 [3], world mm.
+
+    Raises:
+        error: none is given, or there is none at that pixel. SequenceError: the sequence is gone.
+    """
     given = np.array([options.x, options.y, options.z])
     if not np.isnan(given).any():
         return given
     if isnan(options.u) or isnan(options.v):
-        raise TrajectoryError("an orbit needs its point: give x, y and z, or frame, u and v")
+        raise error(f"{what} needs its point: give x, y and z, or frame, u and v")
     poses, camera = twin.sequence().T_world_camera, twin.camera
     if options.frame >= len(poses):
-        raise TrajectoryError(f"orbit: there is no frame {options.frame}; the sequence has {len(poses)}")
+        raise error(f"{what}: there is no frame {options.frame}; the sequence has {len(poses)}")
     mask = np.zeros((camera.height, camera.width), bool)
     column, row = round(options.u), round(options.v)
     if column >= camera.width or row >= camera.height:
-        raise TrajectoryError(
-            f"orbit: pixel {column}, {row} is outside of {camera.width}×{camera.height}; choose another"
+        raise error(
+            f"{what}: pixel {column}, {row} is outside of {camera.width}×{camera.height}; choose another"
         )
     mask[row, column] = True
     hits = Caster(twin.surface, threads=1).cast(camera, poses[options.frame], mask)
     if not len(hits):
-        raise TrajectoryError(
-            f"orbit: pixel {column}, {row} of frame {options.frame} sees no surface; choose another"
-        )
+        raise error(f"{what}: pixel {column}, {row} of frame {options.frame} sees no surface; choose another")
     return surface_points(twin.surface, hits)[0]

@@ -125,6 +125,21 @@ def parse_trajectory(
     return _kept(spec, poses, frame_times(len(poses)), description, gate, gate.judge(poses))
 
 
+def kept_in(trajectory: Trajectory, twin: Twin, camera: Camera) -> Trajectory:
+    """The poses that may be rendered in ``twin`` too, whose surface has changed since they were judged.
+
+    Raises:
+        TrajectoryError: none may.
+    """
+    gate, poses = Gate(twin, camera, trajectory.limits or Limits()), trajectory.T_world_camera
+    words = (trajectory.spec, poses, trajectory.timestamps_s, trajectory.description)
+    kept = _kept(*words, gate, gate.judge(poses))
+    numbers = np.arange(len(poses)) if trajectory.numbers is None else trajectory.numbers
+    dropped = trajectory.counts.get("dropped", 0) + len(poses) - len(kept)
+    counts = {**trajectory.counts, "dropped": dropped}
+    return replace(kept, numbers=numbers[kept.numbers], counts=counts)
+
+
 def allowed_specs() -> str:
     """What may be written for a trajectory, in one line."""
     kinds = [

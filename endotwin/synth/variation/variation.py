@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
+import scipy.sparse
 
 from endotwin.effects import NAMES as EFFECTS
 from endotwin.errors import OptionError
@@ -130,6 +131,11 @@ class Variation:
     region_edits: tuple[tuple[Range, ...], ...] = ()
     effects: dict[str, float] = field(default_factory=dict)
     clip: int = 1
+
+    def carried(self, weights: scipy.sparse.csr_array) -> Variation:
+        """The same for a surface whose vertices have ``weights`` CSR [W, V] of the old ones."""
+        regions = (replace(each, weight=(weights @ each.weight).astype(np.float32)) for each in self.regions)
+        return replace(self, regions=tuple(regions))
 
     def draw(self, frames: int, seed: int) -> tuple[Draw, ...]:
         """One draw a frame, the same for the same seed whatever is rendered."""

@@ -1,0 +1,213 @@
+"""Polyps that are asked for by their Paris class, and where they stand."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
+from math import nan
+
+import numpy as np
+import scipy.sparse
+from scipy.spatial import cKDTree
+
+from endotwin.anatomy import CLASSES, Seedling, Site, grown
+from endotwin.anatomy.shape import Shape
+from endotwin.cameras import Camera
+from endotwin.errors import OptionError, TwinError
+from endotwin.run.streams import Stream
+from endotwin.surface import Surface
+from endotwin.surface.casting import Caster
+from endotwin.surface.vectors import dot, unit
+from endotwin.synth.trajectories import Trajectory
+from endotwin.synth.trajectories.orbit import wall_point
+from endotwin.synth.trajectories.trajectory import parse_options
+from endotwin.twin import Twin
+from endotwin.twin.polyps import MOST_POLYPS
+
+SMALLEST_MM, LARGEST_MM = 1.0, 50.0
+
+VIEWS, GRID = 48, 40
+"""Poses of a trajectory whose view is searched for places, and pixels of a view across and down."""
+
+FACING = 0.35
+"""Least cosine between the wall's normal and the ray to it, of a place drawn by chance."""
+
+FARTHEST_MM = 60.0
+"""Of a place drawn by chance, from a pose that sees it."""
+
+TRIES = 400
+"""Places that are tried for one polyp."""
+
+OFF_MM = 2.0
+"""A point that is given lies on the wall if it is no farther from it."""
+
+
+@dataclass(frozen=True)
+class PolypOptions:
+    """Options of a polyp of any class."""
+
+    size: float = field(default=6.0, metadata={"help": "greatest diameter, of the head of a stalk, mm"})
+    height: float = field(default=0.0, metadata={"help": "above the wall, mm; 0: the class's usual one"})
+    count: int = field(default=1, metadata={"help": "number of such polyps"})
+    ihb: float = field(
+        default=2.9, metadata={"help": "index of haemoglobin above that of the wall", "signed": True}
+    )
+    x: float = field(default=nan, metadata={"help": "place, world mm", "signed": True})
+    y: float = field(default=nan, metadata={"help": "place, world mm", "signed": True})
+    z: float = field(default=nan, metadata={"help": "place, world mm", "signed": True})
+    frame: int = field(default=0, metadata={"help": "or the place at pixel u, v of this frame"})
+    u: float = field(default=nan, metadata={"help": "pixel, to the right"})
+    v: float = field(default=nan, metadata={"help": "pixel, down"})
+
+    @property
+    def placed(self) -> bool:
+        """Whether any part of a place is given."""
+        return not np.isnan([self.x, self.y, self.z, self.u, self.v]).all()
+
+
+def with_polyps(
+    twin: Twin,
+    specs: Iterable[str] | str,
+    seed: int,
+    trajectory: Trajectory | None = None,
+    camera: Camera | None = None,
+) -> tuple[Twin, scipy.sparse.csr_array]:
+    """The fitted twin with polyps, and the weights CSR [W, V] of its old vertices in the new ones.
+
+    Args:
+        specs: ``CLASS:NAME=VALUE,…`` of classes among ``anatomy.CLASSES``, one or several.
+        seed: of shapes, and of places that are not given. trajectory: that sees these, and keeps its
+            clearance from them; None: wherever training photos saw the wall. camera: that it looks through.
+
+    Raises:
+        TwinError: the twin is not fitted. OptionError: a polyp is not understood, or does not fit.
+    """
+    if not twin.fitted:
+        raise TwinError("the twin has no materials yet; run 'endotwin fit' on it first")
+    asked = [(spec, *parse_polyp(spec)) for spec in ([specs] if isinstance(specs, str) else specs)]
+    if len(twin.polyps) + sum(options.count for *_, options in asked) > MOST_POLYPS:
+        raise OptionError(f"a twin holds {MOST_POLYPS} polyps at most; ask for fewer")
+    each = [(spec, kind, options) for spec, kind, options in asked for _ in range(options.count)]
+    garden = _Garden(twin, trajectory, camera or twin.camera)
+    seedlings = [garden.seedling(*one, Stream.POLYP.generator(seed, k)) for k, one in enumerate(each)]
+    return grown(twin, seedlings)
+
+
+def parse_polyp(spec: str) -> tuple[str, PolypOptions]:
+    """The class and the options of ``CLASS:NAME=VALUE,…``; raises OptionError."""
+    kind, _, text = spec.partition(":")
+    if kind not in CLASSES:
+        raise OptionError(
+            f"polyp {spec!r} is of no known class; write {' or '.join(CLASSES)}, with :NAME=VALUE,…"
+        )
+    options = parse_options(spec, text, PolypOptions, "polyp", OptionError)
+    if not SMALLEST_MM <= options.size <= LARGEST_MM:
+        raise OptionError(f"polyp {spec!r}: its size lies between {SMALLEST_MM:g} and {LARGEST_MM:g} mm")
+    low, high = CLASSES[kind].height_range_mm(options.size)
+    if low > high:
+        raise OptionError(f"polyp {spec!r}: {kind} is higher than {low:g} mm, and so no smaller than that")
+    if options.height and not low <= options.height <= high:
+        raise OptionError(
+            f"polyp {spec!r}: {kind} of {options.size:g} mm is {low:g} to {high:g} mm high (Paris classes)"
+        )
+    if options.count < 1 or (options.placed and options.count > 1):
+        raise OptionError(f"polyp {spec!r}: count is at least 1, and 1 where a place is given")
+    return kind, options
+
+
+class _Garden:
+    """The wall of one twin, and the places on it that are taken."""
+
+    def __init__(self, twin: Twin, trajectory: Trajectory | None, camera: Camera):
+        self._twin, self._trajectory, self._camera = twin, trajectory, camera
+        self._caster = Caster(twin.surface)
+        self._taken = [
+            (np.array(polyp.place_mm) - twin.surface.origin_mm, CLASSES[polyp.kind].radius_mm(polyp.size_mm))
+            for polyp in twin.polyps
+        ]
+        self._views: tuple[np.ndarray, np.ndarray] | None = None
+
+    def seedling(
+        self, spec: str, kind: str, options: PolypOptions, generator: np.random.Generator
+    ) -> Seedling:
+        """One polyp at a place that suits it, which is taken then."""
+        height_mm = options.height or CLASSES[kind].usual_height_mm(options.size)
+        shape = Shape.drawn(kind, options.size, height_mm, generator)
+        fault = "no wall is seen"
+        for point, normal in self._places(spec, options, generator):
+            site = Site.at(point, normal, shape.radius_mm, self._caster)
+            fault = self._fault(shape, site, options.placed)
+            if not fault:
+                self._taken.append((site.foot_mm, shape.radius_mm))
+                return Seedling(shape, site, options.ihb)
+        if options.placed:
+            raise OptionError(f"polyp {spec!r} cannot grow: {fault}; choose another place, or a smaller size")
+        raise OptionError(
+            f"polyp {spec!r}: of the wall that is seen, no place that was tried holds it (at the last one, "
+            f"{fault}); choose a smaller size or count, or a place"
+        )
+
+    def _places(
+        self, spec: str, options: PolypOptions, generator: np.random.Generator
+    ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        """Points [3] of the wall, in the surface's frame, and its normals [3]."""
+        surface = self._twin.surface
+        if options.placed:
+            point = wall_point(options, self._twin, f"polyp {spec!r}", OptionError) - surface.origin_mm
+            off_mm, nearest = cKDTree(surface.vertices_mm).query(point)
+            if off_mm > OFF_MM:
+                raise OptionError(
+                    f"polyp {spec!r}: its place is {off_mm:.1f} mm from the surface; give a point of the wall"
+                )
+            yield surface.vertices_mm[nearest].astype(np.float64), surface.normals[nearest]
+            return
+        points, normals = self._seen()
+        for k in generator.permutation(len(points))[:TRIES]:
+            yield points[k], normals[k]
+
+    def _seen(self) -> tuple[np.ndarray, np.ndarray]:
+        """Points [N, 3] of the wall that may be chosen, and normals [N, 3]."""
+        if self._views is None:
+            surface = self._twin.surface
+            if self._trajectory is None:
+                seen = np.flatnonzero((surface.seen_by > 0) & ~surface.filled)
+                self._views = surface.vertices_mm[seen].astype(np.float64), surface.normals[seen]
+            else:
+                chosen = np.linspace(0, len(self._trajectory) - 1, VIEWS).round().astype(int)
+                poses = self._trajectory.T_world_camera[np.unique(chosen)]
+                views = [_seen_from(pose, surface, self._camera, self._caster) for pose in poses]
+                self._views = tuple(np.concatenate(each) for each in zip(*views, strict=True))
+        return self._views
+
+    def _fault(self, shape: Shape, site: Site, placed: bool) -> str:
+        """What hinders the shape from growing at the site, as the end of a sentence."""
+        for foot_mm, radius_mm in self._taken:
+            if np.linalg.norm(site.foot_mm - foot_mm) < shape.radius_mm + radius_mm:
+                return "another polyp stands there"
+        fault = site.fault(shape, self._caster)
+        if fault or placed or self._trajectory is None:
+            return fault
+        limits = self._trajectory.limits
+        clear_mm = shape.size_mm / 2 + (limits.clearance_mm if limits else 0.0)
+        cameras = self._trajectory.T_world_camera[:, :3, 3] - self._twin.surface.origin_mm
+        local = site.within(cameras)
+        local[:, 2] -= np.clip(local[:, 2], 0, shape.height_mm)
+        near = dot(local, local) < clear_mm**2
+        return "a pose of the trajectory is too near to it" if near.any() else ""
+
+
+def _seen_from(
+    T_world_camera: np.ndarray, surface: Surface, camera: Camera, caster: Caster
+) -> tuple[np.ndarray, np.ndarray]:
+    """Points [N, 3] of well seen wall in one view, and normals [N, 3]."""
+    mask = np.zeros((camera.height, camera.width), bool)
+    down, across = (np.linspace(0, size - 1, GRID).astype(int) for size in mask.shape)
+    mask[np.ix_(down, across)] = True
+    hits = caster.cast(camera, T_world_camera, mask)
+    corners = surface.triangles[hits.triangle]
+    measured = (surface.seen_by[corners] > 0).all(axis=1) & ~surface.filled[corners].any(axis=1)
+    points = hits.interpolate(surface, surface.vertices_mm.astype(np.float64))
+    normals = unit(hits.interpolate(surface, surface.normals))
+    rays = unit(points - surface.to_local(T_world_camera)[:3, 3])
+    chosen = measured & (dot(rays, normals) < -FACING) & (hits.distance_mm < FARTHEST_MM)
+    return points[chosen], normals[chosen]
