@@ -29,6 +29,9 @@ STEPS, POLISH_STEPS = 12, 30
 TOLERANCE = 1e-3
 """The search ends when positions move by less than this share of the ring's radius, or the loss by less."""
 
+DEEPEST = 1.0
+"""Of the ring's radius: guides lie at most so far behind the lens."""
+
 ASIDE, POLISH_ASIDE = 0.1, 0.05
 """Of the ring's radius: by so much guides are moved to find what their positions change. With less, the
 shadows that jump from pixel to pixel hide it."""
@@ -110,37 +113,46 @@ class Search:
         return [np.vstack([known_mm, candidate]) for candidate in self._candidates]
 
     def polished(self) -> Guides:
-        """The base's own guides, moved to where they predict best beside all that was kept since."""
-        first = self._plane(self._refined(self._base.hypothesis.guides_mm))
+        """The base's own guides, moved to where they predict best beside all that was kept since: in the
+        plane of the lens, then behind it, too."""
+        within = self._refined(self._base.hypothesis.guides_mm)
+        first = self._coordinates(self._refined(within, axes=3), axes=3)
         options = {
             "maxfev": POLISH_STEPS * len(first) // 2,
             "xatol": TOLERANCE,
-            "fatol": TOLERANCE * self._loss(self._guides(first)),
-            "initial_simplex": np.vstack([first, first + POLISH_ASIDE * np.eye(len(first))]),
+            "fatol": TOLERANCE * self._loss(self._guides(first, axes=3)),
+            "initial_simplex": np.vstack([first, first - POLISH_ASIDE * np.eye(len(first))]),
         }
-        found = minimize(lambda x: self._loss(self._guides(x)), first, method="Nelder-Mead", options=options)
-        return _plain(self._guides(found.x))
+        found = minimize(
+            lambda x: self._loss(self._guides(x, axes=3)), first, method="Nelder-Mead", options=options
+        )
+        return _plain(self._guides(found.x, axes=3))
 
-    def _refined(self, start_mm: Guides | np.ndarray) -> Guides:
-        """Guides moved from ``start_mm`` [K, 3] in the plane of the lens by Gauss–Newton."""
+    def _refined(self, start_mm: Guides | np.ndarray, axes: int = 2) -> Guides:
+        """Guides moved from ``start_mm`` [K, 3] by Gauss–Newton, in the plane of the lens, or along 3
+        axes."""
 
         def residuals(x: np.ndarray) -> np.ndarray:
-            return self._residuals(self._guides(x))
+            return self._residuals(self._guides(x, axes))
 
         def slopes(x: np.ndarray) -> np.ndarray:
             aside = [residuals(x + step) - residuals(x - step) for step in ASIDE * np.eye(len(x))]
             return np.stack(aside, axis=1) / (2 * ASIDE)
 
-        first = self._plane(start_mm)
+        first = self._coordinates(start_mm, axes)
         found = least_squares(residuals, first, slopes, xtol=TOLERANCE, ftol=TOLERANCE, max_nfev=STEPS)
-        return _plain(self._guides(found.x))
+        return _plain(self._guides(found.x, axes))
 
-    def _plane(self, guides_mm: Guides | np.ndarray) -> np.ndarray:
-        """x and y of K guides in ring's radii, [2K]."""
-        return np.asarray(guides_mm, np.float64)[:, :2].ravel() / self._radius_mm
+    def _coordinates(self, guides_mm: Guides | np.ndarray, axes: int) -> np.ndarray:
+        """The first so many coordinates of K guides in ring's radii, [K · axes]."""
+        return np.asarray(guides_mm, np.float64)[:, :axes].ravel() / self._radius_mm
 
-    def _guides(self, x: np.ndarray) -> np.ndarray:
-        return np.c_[x.reshape(-1, 2), np.zeros(len(x) // 2)].astype(np.float32) * np.float32(self._radius_mm)
+    def _guides(self, x: np.ndarray, axes: int) -> np.ndarray:
+        """Guides float32 [K, 3] of those coordinates; none lies before the lens, or DEEPEST behind it."""
+        x = x.reshape(-1, axes)
+        guides = np.pad(x, ((0, 0), (0, 3 - axes))).astype(np.float32)
+        guides[:, 2] = np.clip(guides[:, 2], -DEEPEST, 0)
+        return guides * np.float32(self._radius_mm)
 
     def _loss(self, guides_mm: np.ndarray) -> float:
         return float((self._residuals(np.asarray(guides_mm)) ** 2).sum()) / 2
