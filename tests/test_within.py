@@ -10,7 +10,7 @@ from endotwin.effects import Decision
 from endotwin.effects.coat import Coat
 from endotwin.evidence.coat import judged
 from endotwin.fit.model import Globals, predict
-from endotwin.fit.within import Within
+from endotwin.fit.within import Varied, Within
 from endotwin.pixels.samples import Samples, Views
 from endotwin.twin import Light, Response
 
@@ -57,10 +57,10 @@ def test_light_response_and_f0_are_found_beside_an_albedo_that_is_nowhere_right(
     grey[:, :3] = 0.4
     shared = Globals.of(Light(120.0, n, q), Response(gamma), f0=0.06)
     for _ in range(8):
-        shared, _ = within.renewed(grey, shared, (), NOISE)
+        shared = within.renewed(grey, shared, (), NOISE).shared
     assert told(shared)[:3] == pytest.approx(told(TRUE)[:3], rel=0.02)
     for _ in range(4):
-        shared, _ = within.renewed(material, shared, (), NOISE)
+        shared = within.renewed(material, shared, (), NOISE).shared
     assert told(shared) == pytest.approx(told(TRUE), rel=0.01)
 
 
@@ -71,7 +71,7 @@ def test_a_coat_is_found_with_its_roughness_tail_and_weight(tail):
     assert decision.state == "on" and (coat.roughness, coat.tail) == (0.19, tail)
     shared = replace(TRUE, coat=coat)
     for _ in range(6):
-        shared, _ = within.renewed(material, shared, (), NOISE)
+        shared = within.renewed(material, shared, (), NOISE).shared
     assert shared.coat.weight == pytest.approx(0.8, rel=0.05)
     assert told(shared) == pytest.approx(told(TRUE), rel=0.02)
 
@@ -97,8 +97,8 @@ def test_gains_that_follow_the_distance_are_told_from_the_falloff():
     shared, log_gain = Globals.of(Light(120.0, 2.0, 2.0), Response(0.36), f0=0.035), torch.zeros(SIGHTINGS)
     for _ in range(8):
         exposed = replace(within, samples=replace(samples, log_exposure=log_gain[frame]))
-        shared, more = exposed.renewed(material, shared, (), NOISE, SIGHTINGS)
-        log_gain = log_gain + torch.from_numpy(more)
+        found = exposed.renewed(material, shared, (), NOISE, Varied(SIGHTINGS))
+        shared, log_gain = found.shared, log_gain + torch.from_numpy(found.log_gain)
     assert told(shared)[:3] == pytest.approx(told(TRUE)[:3], rel=0.02)
     np.testing.assert_allclose(log_gain - log_gain.mean(), true - true.mean(), atol=0.03)
 
@@ -106,7 +106,7 @@ def test_gains_that_follow_the_distance_are_told_from_the_falloff():
 def test_what_is_held_stays():
     within, material = photographed()
     shared = Globals.of(Light(120.0, 2.0, 2.0), Response(0.45), f0=0.05)
-    renewed, _ = within.renewed(material, shared, ("n", "gamma"), NOISE)
+    renewed = within.renewed(material, shared, ("n", "gamma"), NOISE).shared
     assert (renewed.gamma, renewed.log_light[1]) == (pytest.approx(0.45), pytest.approx(2.0))
     assert renewed.log_light[2] != pytest.approx(2.0, rel=1e-3)
 
@@ -114,14 +114,14 @@ def test_what_is_held_stays():
 def test_without_a_specular_lobe_f0_stays():
     within, material = photographed()
     shared = replace(TRUE, specular=False)
-    assert within.renewed(material, shared, (), NOISE)[0].vector[4] == TRUE.vector[4]
+    assert within.renewed(material, shared, (), NOISE).shared.vector[4] == TRUE.vector[4]
 
 
 def test_photos_of_one_distance_leave_the_falloff_near_its_prior():
     within, material = photographed()
     samples = replace(within.samples, log_distance=torch.full_like(within.samples.log_distance, np.log(20)))
     shared = Globals.of(Light(120.0, 1.7, 2.0), Response(0.42), f0=0.035)
-    found, _ = replace(within, samples=samples).renewed(material, shared, (), NOISE)
+    found = replace(within, samples=samples).renewed(material, shared, (), NOISE).shared
     assert found.log_light[2] == pytest.approx(2.0, rel=0.1)
     assert found.gamma == pytest.approx(0.42, rel=0.01)
 
@@ -129,7 +129,7 @@ def test_photos_of_one_distance_leave_the_falloff_near_its_prior():
 def test_photos_without_a_usable_pixel_change_nothing():
     within, material = photographed()
     white = replace(within.samples, color=torch.full_like(within.samples.color, 255))
-    assert replace(within, samples=white).renewed(material, TRUE, (), NOISE)[0] is TRUE
+    assert replace(within, samples=white).renewed(material, TRUE, (), NOISE).shared is TRUE
 
 
 def test_under_a_coat_that_shines_a_clipped_photo_says_at_least():

@@ -10,7 +10,8 @@ from endotwin.effects.effect import Effect
 
 @dataclass(frozen=True)
 class Offset(Effect):
-    """Guides at ``guides_mm`` in the camera frame, equally bright, in the plane of the lens (z = 0).
+    """Guides at ``guides_mm`` in the camera frame, equally bright, in the plane of the lens (z = 0) or behind
+    it.
 
     Each shines along the optical axis with the light's n and q; together they have its L0.
     """

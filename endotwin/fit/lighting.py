@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -11,9 +12,11 @@ from torch import Tensor
 
 from endotwin.effects import Effects
 from endotwin.effects.gain import Gain
+from endotwin.effects.offset import Offset
 from endotwin.fit.gauss_newton import HUBER, GaussNewton, State
 from endotwin.fit.model import Globals, at_pixels, slope_by_log_exposure
 from endotwin.fit.normal_equations import Residual
+from endotwin.fit.within import Renewed, Varied
 from endotwin.light import shading
 from endotwin.light.bounced import Albedo, BouncedLight, Places
 from endotwin.light.guides import AT_LENS, COSINE, Guided, guided, log_axis, visible_from
@@ -75,6 +78,19 @@ def _guided(samples: Samples, surface: Surface, caster: Caster, effects: Effects
     return Guided(**{name: torch.from_numpy(value) for name, value in found.items()})
 
 
+def guides_aside(samples: Samples, surface: Surface, effects: Effects, step_mm: float) -> Iterator[Samples]:
+    """``samples`` lit by each guide moved by ``step_mm`` along x, then along y and z; without shadows."""
+    guides_mm = np.asarray(effects.guides_mm, np.float32)
+    corners = surface.normals[surface.triangles[samples.triangle.numpy()]]
+    normals = np.einsum("nk,nka->na", samples.barycentric.numpy(), corners)
+    normals = unit(np.einsum("na,nab->nb", normals, samples.rotation))
+    for k in range(len(guides_mm)):
+        for axis in range(3):
+            moved_mm = guides_mm.copy()
+            moved_mm[k, axis] += step_mm
+            yield replace(samples, guides=guided(samples.points_mm, normals, moved_mm, effects.profile))
+
+
 class Relighting:
     """What of the light depends on the materials, renewed as the fit finds them."""
 
@@ -82,6 +98,7 @@ class Relighting:
         if "gain" in effects:
             effects = effects.including(effects["gain"].at(views.frames))
         self.effects = effects
+        self._surface, self._caster = surface, caster
         self._bouncer = Bouncer(surface, caster, effects, views) if effects.bounce else None
 
     @property
@@ -93,14 +110,34 @@ class Relighting:
         return self.bounces or "gain" in self.effects
 
     @property
-    def gained_frames(self) -> int:
-        """How many frames have a gain of their own."""
-        return len(self.effects["gain"].frames) if "gain" in self.effects else 0
+    def varied(self) -> Varied:
+        """What the light's steps may change beside light and response. Guides that cast shadows stay: by
+        these the probe has found them better than shading can."""
+        frames = len(self.effects["gain"].frames) if "gain" in self.effects else 0
+        if self.effects.guides_mm is None or "shadows" in self.effects:
+            return Varied(frames)
 
-    def regain(self, solver: GaussNewton, log_gain: np.ndarray) -> None:
-        """Add to the logarithm of each frame's gain [F], and relight the samples of ``solver``."""
-        self.effects = _brightened(self.effects, log_gain)
-        solver.relight(exposed(solver.samples, self.effects))
+        def aside(samples: Samples, step_mm: float) -> Iterator[Samples]:
+            return guides_aside(samples, self._surface, self.effects, step_mm)
+
+        return Varied(frames, aside, len(self.effects.guides_mm))
+
+    def vary(self, solver: GaussNewton, found: Renewed) -> None:
+        """Gains and guides as a step has ``found`` them, and the samples of ``solver`` lit so."""
+        if len(found.log_gain):
+            self.effects = _brightened(self.effects, found.log_gain)
+            solver.relight(exposed(solver.samples, self.effects))
+        if len(found.aside_mm):
+            guides_mm = np.asarray(self.effects.guides_mm) + found.aside_mm
+            guides_mm[:, 2] = np.minimum(guides_mm[:, 2], 0)
+            self.effects = self.effects.including(Offset(tuple(map(tuple, guides_mm.tolist()))))
+            solver.relight(self.guided(solver.samples))
+
+    def guided(self, samples: Samples) -> Samples:
+        """``samples`` lit by the guides where they were found last."""
+        if not self.varied.guides:
+            return samples
+        return replace(samples, guides=_guided(samples, self._surface, self._caster, self.effects))
 
     def without_bounce(self, solver: GaussNewton, state: State) -> State:
         """From here on no light bounces: the photos show none. ``state`` as if there had never been any."""

@@ -163,6 +163,7 @@ def fit_twin(
         parts = samples[rows], samples[torch.from_numpy(white)]
         state, cost, coat = _find_light(*parts, surface, start, pace, relighting, wanted, device)
     with stopwatch.stage("detail"):
+        samples = relighting.guided(samples)
         state, normals, left = _find_detail(samples, twin, state, cost, pace, relighting, device)
         twin = replace(twin, surface=replace(surface, normals=normals))
     with stopwatch.stage("film"):
@@ -250,7 +251,7 @@ def _find_light(
         material = at_pixels(solver.samples, solver.triangles, state.materials)
         shared, noise = state.shared, solver.noise(state)
         if number == (0 if coat == "on" else COAT_STEP):
-            under = relighting.relit(clipped, solver.triangles, state)
+            under = relighting.relit(relighting.guided(clipped), solver.triangles, state)
             shiny = Samples.joined([solver.samples, under], solver.samples.views)
             seen = Within.of(shiny, surface, unit)
             seen_material = at_pixels(shiny, solver.triangles, state.materials)
@@ -259,10 +260,9 @@ def _find_light(
         if relighting.bounces:
             solver.held = (*start.undetermined, "L0", *(("albedo scale",) * (number < HOLD_STEPS)))
         else:
-            frames = relighting.gained_frames
-            shared, log_gain = within.renewed(material, shared, start.undetermined, noise, frames)
-            if frames:
-                relighting.regain(solver, log_gain)
+            found = within.renewed(material, shared, start.undetermined, noise, relighting.varied)
+            relighting.vary(solver, found)
+            shared = found.shared
         state = replace(state, shared=shared)
         if late:
             break

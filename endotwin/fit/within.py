@@ -5,13 +5,14 @@ vertex's mean takes it out exactly: what is left varies with distance, angle and
 beside smooth albedo features, no texture can pass for shading, whatever those features cannot follow.
 
 The gain of a frame is an intercept, too. A camera that comes nearer turns its gain down, so that gains pass
-for most of the fall-off: found in turns with it, they would stay where they were first guessed.
+for most of the fall-off: found in turns with it, they would stay where they were first guessed. So would
+guides, whose places pass for the light's exponents.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -22,7 +23,7 @@ from torch import Tensor
 from endotwin.effects.coat import Coat
 from endotwin.evidence.coat import LEAST_SIGHTINGS, Highlights
 from endotwin.fit.gauss_newton import TEMPER, bounded, free_directions, global_prior
-from endotwin.fit.model import GLOBALS, Globals, linearise
+from endotwin.fit.model import GLOBALS, Globals, linearise, predict
 from endotwin.light import shading
 from endotwin.pixels.fixed_effects import Design, regress
 from endotwin.pixels.samples import Samples
@@ -44,6 +45,41 @@ HIGHLIGHT_PIXELS = 30_000
 F0 = GLOBALS.index("ln f0")
 REWEIGHTS = 4
 
+ASIDE = 0.005
+"""Guides are moved by this share of the median viewing distance to find what their places change."""
+
+ASIDE_SPREAD = 0.02
+"""Standard deviation of a step of theirs, as a share of that distance: what the probe leaves open."""
+
+
+@dataclass(frozen=True)
+class Varied:
+    """What may change with light and response.
+
+    Attributes:
+        frames: how many frames have gains of their own, one after the other as in the samples' views.
+        aside: samples, and mm, to the same ones lit by guides moved so far: each in turn, along x, then
+            y and z; None: they stay, or the light is at the lens.
+        guides: how many there are.
+    """
+
+    frames: int = 0
+    aside: Callable[[Samples, float], Iterator[Samples]] | None = None
+    guides: int = 0
+
+
+STILL = Varied()
+
+
+@dataclass(frozen=True)
+class Renewed:
+    """What a step has found: ``shared``, and what it adds to ln of each frame's gain, float64 [frames], and
+    to the guides' places, float64 [guides, 3], mm."""
+
+    shared: Globals
+    log_gain: np.ndarray
+    aside_mm: np.ndarray
+
 
 @dataclass(frozen=True)
 class Sightings:
@@ -51,8 +87,8 @@ class Sightings:
 
     Attributes:
         vertex, frame: int [S]. residual: ln photo − ln prediction [S]. slopes: d ln C by the shared
-            parameters [S, G]. by_coat: d ln C by the coat's weight [S], 0 without one. weight: inverse
-            variance [S].
+            parameters [S, G]. by_coat: d ln C by the coat's weight [S], 0 without one. by_guides: d ln C by
+            the guides' places, 1/mm [S, 3K]. weight: inverse variance [S].
     """
 
     vertex: np.ndarray
@@ -60,6 +96,7 @@ class Sightings:
     residual: np.ndarray
     slopes: np.ndarray
     by_coat: np.ndarray
+    by_guides: np.ndarray
     weight: np.ndarray
 
 
@@ -81,21 +118,21 @@ class Within:
         return cls(samples, samples.nearest(surface.triangles), len(surface.vertices_mm), unit_mm)
 
     def renewed(
-        self, material: Tensor, shared: Globals, held: tuple[str, ...], noise: float, frames: int = 0
-    ) -> tuple[Globals, np.ndarray]:
-        """``shared`` after a Gauss–Newton step: light and response by what is off the highlights, then f0 and
-        the coat by all; and what the first adds to the logarithms of the ``frames``' gains, [frames].
+        self, material: Tensor, shared: Globals, held: tuple[str, ...], noise: float, varied: Varied = STILL
+    ) -> Renewed:
+        """A Gauss–Newton step: light, response and what is ``varied`` by what is off the highlights, then f0
+        and the coat by all.
 
         Args:
             material: [N, 4] at the samples. held: which of n, q and gamma stay. noise: of a pixel, in display
-                values. frames: of the samples' views, if each has a gain of its own; 0: none has.
+                values.
         """
         diffuse = self.samples.sin2 > DIFFUSE_SIN2
-        shared, log_gain = self._step(material, shared, (*held, "level", "f0"), diffuse, noise, frames)
-        if shared.specular:
-            kept = ("level", "n", "q", "gamma")
-            shared, _ = self._step(material, shared, kept, torch.ones_like(diffuse), noise)
-        return shared, log_gain
+        found = self._step(material, shared, (*held, "level", "f0"), diffuse, noise, varied)
+        if not shared.specular:
+            return found
+        kept, every = ("level", "n", "q", "gamma"), torch.ones_like(diffuse)
+        return replace(found, shared=self._step(material, found.shared, kept, every, noise).shared)
 
     def highlights(self, material: Tensor, shared: Globals, noise: float) -> Callable[[Coat], Highlights]:
         """Sightings near the mirror direction, by a coat of weight 0 over them.
@@ -119,34 +156,55 @@ class Within:
         held: tuple[str, ...],
         chosen: Tensor,
         noise: float,
-        frames: int = 0,
-    ) -> tuple[Globals, np.ndarray]:
-        coated = "f0" not in held and shared.coat is not None
+        varied: Varied = STILL,
+    ) -> Renewed:
         free = free_directions(shared, held)
-        seen = self.sightings(material, shared, chosen, noise)
+        seen = self.sightings(material, shared, chosen, noise, varied)
         if not free.shape[1] or len(seen.residual) < LEAST_SIGHTINGS:
-            return shared, np.zeros(frames)
-        mean, spread = (x.numpy() for x in global_prior(self.unit_mm, len(shared.vector)))
-        precision = free.T @ np.diag(TEMPER / spread**2) @ free
-        pull = free.T @ (TEMPER * (mean - shared.vector.numpy()) / spread**2)
-        columns = seen.slopes @ free
-        if coated:
-            columns = np.c_[columns, seen.by_coat]
-            precision = scipy.linalg.block_diag(precision, TEMPER / COAT_SPREAD**2)
-            pull = np.r_[pull, -TEMPER * shared.coat.weight / COAT_SPREAD**2]
-        frame = np.searchsorted(self.samples.views.frames, seen.frame) if frames else None
-        design = Design(columns, seen.vertex, self.count, frame, seen.weight, (precision, pull))
-        fitted = regress(seen.residual, design, frames, rounds=REWEIGHTS)
-        found = fitted.coefficients
-        along = free @ found[: free.shape[1]]
+            return Renewed(shared, np.zeros(varied.frames), np.zeros((varied.guides, 3)))
+        frame = np.searchsorted(self.samples.views.frames, seen.frame) if varied.frames else None
+        coated = "f0" not in held and shared.coat is not None
+        columns, prior = self._columns(seen, shared, free, coated)
+        design = Design(columns, seen.vertex, self.count, frame, seen.weight, prior)
+        found = regress(seen.residual, design, varied.frames, rounds=REWEIGHTS)
+        along = free @ found.coefficients[: free.shape[1]]
+        spread = global_prior(self.unit_mm, len(shared.vector))[1].numpy()
         length = min(1.0, float((spread / np.maximum(np.abs(along), 1e-12)).min()))
         if coated:
-            weight = max(0.0, shared.coat.weight + length * float(found[-1]))
+            weight = max(0.0, shared.coat.weight + length * float(found.coefficients[-1]))
             shared = replace(shared, coat=replace(shared.coat, weight=weight))
-        log_gain = length / shared.gamma * fitted.intercepts if frames else np.zeros(0)
-        return bounded(shared, shared.vector + torch.from_numpy(length * along)), log_gain
+        places = found.coefficients[free.shape[1] :][: 3 * varied.guides].reshape(-1, 3)
+        log_gain = found.intercepts / shared.gamma if varied.frames else np.zeros(0)
+        moved = bounded(shared, shared.vector + torch.from_numpy(length * along))
+        return Renewed(moved, length * log_gain, length * places)
 
-    def sightings(self, material: Tensor, shared: Globals, chosen: Tensor, noise: float) -> Sightings:
+    def _columns(
+        self, seen: Sightings, shared: Globals, free: np.ndarray, coated: bool
+    ) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]:
+        """Columns of the ``free`` directions, of the guides' places, and of the coat where it is sought; and
+        what is known of their coefficients."""
+        mean, spread = (x.numpy() for x in global_prior(self.unit_mm, len(shared.vector)))
+        guides = seen.by_guides.shape[1]
+        parts = [
+            free.T @ np.diag(TEMPER / spread**2) @ free,
+            np.eye(guides) * TEMPER / (ASIDE_SPREAD * self.distance_mm) ** 2,
+        ]
+        pulls = [free.T @ (TEMPER * (mean - shared.vector.numpy()) / spread**2), np.zeros(guides)]
+        columns = [seen.slopes @ free, seen.by_guides]
+        if coated:
+            columns.append(seen.by_coat[:, None])
+            parts.append(TEMPER / COAT_SPREAD**2)
+            pulls.append([-TEMPER * shared.coat.weight / COAT_SPREAD**2])
+        return np.hstack(columns), (scipy.linalg.block_diag(*parts), np.concatenate(pulls))
+
+    @property
+    def distance_mm(self) -> float:
+        """Median viewing distance."""
+        return float(self.samples.log_distance.median().exp())
+
+    def sightings(
+        self, material: Tensor, shared: Globals, chosen: Tensor, noise: float, varied: Varied = STILL
+    ) -> Sightings:
         """Sightings of the ``chosen`` samples (bool [N]) that are neither dark nor clipped; but under a coat
         that shines a clipped channel says 'at least'.
 
@@ -169,11 +227,27 @@ class Within:
         by_coat = np.zeros(len(predicted))
         if model.by_coat is not None:
             by_coat = (model.by_coat[bright] * tells).mean(dim=1).numpy() / predicted
+        by_guides = self._by_guides(rows, material, shared, predicted - floor, varied) / predicted
         weight = 1 / ((noise / predicted) ** 2 + MODEL_ERROR**2)
         place = self.vertex[rows.numpy()].astype(np.int64) << 32 | self.samples.frame[rows].numpy()
         place, which = np.unique(place, return_inverse=True)
         total = np.bincount(which, weight, len(place))
-        averaged = (residual, by_coat, *slopes.T)
+        averaged = (residual, by_coat, *slopes.T, *by_guides)
         means = [np.bincount(which, weight * column, len(place)) / total for column in averaged]
+        slopes, by_guides = np.split(np.stack(means[2:], axis=1), [slopes.shape[1]], axis=1)
         frame = (place & 0xFFFFFFFF).astype(np.int32)
-        return Sightings(place >> 32, frame, means[0], np.stack(means[2:], axis=1), means[1], total)
+        return Sightings(place >> 32, frame, means[0], slopes, means[1], by_guides, total)
+
+    def _by_guides(
+        self, rows: Tensor, material: Tensor, shared: Globals, predicted: np.ndarray, varied: Varied
+    ) -> np.ndarray:
+        """Slopes [3K, R] of the mean display values ``predicted`` [R] of samples ``rows`` by the guides'
+        places, 1/mm."""
+        slopes = np.zeros((3 * varied.guides, len(predicted)))
+        if varied.guides:
+            step_mm, material = ASIDE * self.distance_mm, material[rows]
+            for slope, moved in zip(slopes, varied.aside(self.samples[rows], step_mm), strict=True):
+                slope[:] = (
+                    predict(moved, material, shared).double().mean(dim=1).numpy() - predicted
+                ) / step_mm
+        return slopes
