@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from endotwin.cameras import read_camera
 from endotwin.config import STANDARD, FitConfig, FuseConfig
-from endotwin.errors import OptionError, SequenceError
+from endotwin.errors import OptionError, SequenceError, TwinError
 from endotwin.fit import fit
 from endotwin.render.price import priced
 from endotwin.run.stopwatch import Stopwatch
@@ -116,11 +116,12 @@ def align_twin(twin: Twin | Path | str, state: str = "auto", *, progress: Progre
         progress: called with (label, done, total).
 
     Raises:
-        OptionError: another state. SequenceError: the twin's sequence has moved or cannot be read.
+        OptionError: another state. SequenceError: the twin's sequence has moved or cannot be read. TwinError:
+            polyps were grown on the twin.
     """
     from endotwin.align import align
 
-    return align(as_twin(twin), state, progress)[0]
+    return align(_as_recorded(twin), state, progress)[0]
 
 
 def fit_twin(
@@ -155,16 +156,25 @@ def fit_twin(
 
     Raises:
         OptionError: an option makes no sense. SequenceError: the twin's sequence has moved or cannot be read.
+        TwinError: polyps were grown on the twin.
     """
     for name, value in (("budget", budget_s), ("number of epochs", epochs)):
         if value is not None:
             _check_positive(name, value)
-    twin = as_twin(twin)
+    twin = _as_recorded(twin)
     config = replace(config, method=method or config.method, budget=budget_s or config.budget)
     undecided = "align" not in twin.record and config.method == "twin" and config.budget is None
     if align is not None or undecided:
         twin = align_twin(twin, align or "auto", progress=progress)
     return fit(twin, config, epochs, seed, progress, checkpoint, effects, priced, device)
+
+
+def _as_recorded(twin: Twin | Path | str) -> Twin:
+    """A twin whose surface is what its photos show."""
+    twin = as_twin(twin)
+    if twin.polyps:
+        raise TwinError("polyps were grown on this twin, and its photos show none: take the one without them")
+    return twin
 
 
 def synthesize(

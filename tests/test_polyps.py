@@ -248,6 +248,12 @@ def test_a_twin_with_polyps_is_saved_and_takes_more(bare, several, tmp_path):
         Twin.load(tmp_path / "damaged")
 
 
+def test_photos_are_not_fitted_or_aligned_to_a_twin_with_polyps_which_they_do_not_show(several):
+    for found in (endotwin.fit_twin, endotwin.align_twin):
+        with pytest.raises(TwinError, match="take the one without them"):
+            found(several)
+
+
 def test_a_polyp_beside_another_leaves_it_as_it_is(bare):
     """Wall of both gives the second its colour, and its triangles are the first one's neighbours."""
     x, y, z = tube_twin.axis(np.array(0.8))[0] + [0, tube_twin.RADIUS_MM, 0]
