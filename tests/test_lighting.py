@@ -89,6 +89,13 @@ def test_a_guide_that_casts_no_shadow_is_found_behind_the_lens_from_a_millimetre
     assert (shared.gamma, *shared.log_light[1:]) == pytest.approx(told, rel=0.03)
 
 
+def test_where_no_pixel_is_clipped_guides_light_none_of_them(exposed_unevenly):
+    twin, samples, _ = exposed_unevenly
+    effects = Effects([Specular(), Offset(((2.0, -1.0, 0.0),))])
+    none = lit(samples[:0], twin.surface, Caster(twin.surface), effects)
+    assert len(none) == len(none.guides) == 0
+
+
 def test_guides_that_cast_shadows_stay_where_those_told():
     twin = tube_twin.fitted(tube_twin.seen(tube_twin.surface()))
     effects = Effects([Specular(), Offset(((2.0, -1.0, 0.0),)), Shadows()])

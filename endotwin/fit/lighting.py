@@ -64,7 +64,7 @@ def _guided(samples: Samples, surface: Surface, caster: Caster, effects: Effects
     found = {
         name: np.empty((len(samples), len(guides_mm)), np.float32) for name in Guided.__dataclass_fields__
     }
-    for rows in np.split(order, np.flatnonzero(np.diff(view[order])) + 1):
+    for rows in filter(len, np.split(order, np.flatnonzero(np.diff(view[order])) + 1)):
         part = samples[torch.from_numpy(rows)]
         pose = views.T_local_camera[view[rows[0]]]
         corners = surface.normals[surface.triangles[part.triangle.numpy()]]
