@@ -227,7 +227,9 @@ class Within:
         by_coat = np.zeros(len(predicted))
         if model.by_coat is not None:
             by_coat = (model.by_coat[bright] * tells).mean(dim=1).numpy() / predicted
-        by_guides = self._by_guides(rows, material, shared, predicted - floor, varied) / predicted
+        by_guides = (
+            self._by_guides(rows, material, shared, varied, model.predicted[bright], tells) / predicted
+        )
         weight = 1 / ((noise / predicted) ** 2 + MODEL_ERROR**2)
         place = self.vertex[rows.numpy()].astype(np.int64) << 32 | self.samples.frame[rows].numpy()
         place, which = np.unique(place, return_inverse=True)
@@ -239,15 +241,20 @@ class Within:
         return Sightings(place >> 32, frame, means[0], slopes, means[1], by_guides, total)
 
     def _by_guides(
-        self, rows: Tensor, material: Tensor, shared: Globals, predicted: np.ndarray, varied: Varied
+        self,
+        rows: Tensor,
+        material: Tensor,
+        shared: Globals,
+        varied: Varied,
+        predicted: Tensor,
+        tells: Tensor,
     ) -> np.ndarray:
-        """Slopes [3K, R] of the mean display values ``predicted`` [R] of samples ``rows`` by the guides'
-        places, 1/mm."""
-        slopes = np.zeros((3 * varied.guides, len(predicted)))
+        """Slopes [3K, R] of the mean display values of samples ``rows`` by the guides' places, 1/mm; by the
+        channels, of those ``predicted`` [R, 3], of which the photo ``tells`` [R, 3]."""
+        slopes = np.zeros((3 * varied.guides, len(rows)))
         if varied.guides:
             step_mm, material = ASIDE * self.distance_mm, material[rows]
             for slope, moved in zip(slopes, varied.aside(self.samples[rows], step_mm), strict=True):
-                slope[:] = (
-                    predict(moved, material, shared).double().mean(dim=1).numpy() - predicted
-                ) / step_mm
+                change = (predict(moved, material, shared) - predicted) * tells
+                slope[:] = change.mean(dim=1).numpy() / step_mm
         return slopes
