@@ -19,7 +19,7 @@ from scipy.special import xlogy
 from endotwin.pixels.samples import Samples
 from endotwin.pixels.start import Start
 from endotwin.surface import Surface
-from endotwin.surface.vectors import dot, unit
+from endotwin.surface.vectors import dot
 
 PIXELS = 500_000
 """Samples among which glints are sought, all of some vertices."""
@@ -130,10 +130,7 @@ class Glints:
 def crossings_mm(samples: Samples, surface: Surface) -> tuple[np.ndarray, np.ndarray]:
     """Where N viewing rays, mirrored about the surface's normals, meet the plane of the lens: x and y in the
     camera frame [N, 2]; and which are steep enough to tell, bool [N]."""
-    corners = surface.normals[surface.triangles[samples.triangle.numpy()]]
-    share, rotation = samples.barycentric.numpy(), samples.rotation
-    normals = unit(np.einsum("nk,nka,nab->nb", share, corners, rotation, optimize=True))
-    view, points_mm = samples.directions, samples.points_mm
+    normals, view, points_mm = samples.normals(surface), samples.directions, samples.points_mm
     mirrored = view - 2 * dot(view, normals)[:, None] * normals
     down = np.minimum(mirrored[:, 2], -STEEPEST)
     at_mm = points_mm - (points_mm[:, 2] / down)[:, None] * mirrored

@@ -81,14 +81,12 @@ def _guided(samples: Samples, surface: Surface, caster: Caster, effects: Effects
 def guides_aside(samples: Samples, surface: Surface, effects: Effects, step_mm: float) -> Iterator[Samples]:
     """``samples`` lit by each guide moved by ``step_mm`` along x, then along y and z; without shadows."""
     guides_mm = np.asarray(effects.guides_mm, np.float32)
-    corners = surface.normals[surface.triangles[samples.triangle.numpy()]]
-    normals = np.einsum("nk,nka->na", samples.barycentric.numpy(), corners)
-    normals = unit(np.einsum("na,nab->nb", normals, samples.rotation))
+    normals, points_mm = samples.normals(surface), samples.points_mm
     for k in range(len(guides_mm)):
         for axis in range(3):
             moved_mm = guides_mm.copy()
             moved_mm[k, axis] += step_mm
-            yield replace(samples, guides=guided(samples.points_mm, normals, moved_mm, effects.profile))
+            yield replace(samples, guides=guided(points_mm, normals, moved_mm, effects.profile))
 
 
 class Relighting:
@@ -124,14 +122,17 @@ class Relighting:
 
     def vary(self, solver: GaussNewton, found: Renewed) -> None:
         """Gains and guides as a step has ``found`` them, and the samples of ``solver`` lit so."""
+        samples = solver.samples
         if len(found.log_gain):
             self.effects = _brightened(self.effects, found.log_gain)
-            solver.relight(exposed(solver.samples, self.effects))
+            samples = exposed(samples, self.effects)
         if len(found.aside_mm):
             guides_mm = np.asarray(self.effects.guides_mm) + found.aside_mm
             guides_mm[:, 2] = np.minimum(guides_mm[:, 2], 0)
             self.effects = self.effects.including(Offset(tuple(map(tuple, guides_mm.tolist()))))
-            solver.relight(self.guided(solver.samples))
+            samples = self.guided(samples)
+        if samples is not solver.samples:
+            solver.relight(samples)
 
     def guided(self, samples: Samples) -> Samples:
         """``samples`` lit by the guides where they were found last."""

@@ -20,8 +20,10 @@ from endotwin.pixels.pace import Pace
 from endotwin.run.ahead import ahead
 from endotwin.run.threads import THREADS
 from endotwin.sequence import Frame
+from endotwin.surface import Surface
 from endotwin.surface.casting import Caster, Correspondences
 from endotwin.surface.silhouettes import discontinuities
+from endotwin.surface.vectors import unit
 from endotwin.twin import Twin
 
 DEPTH_TOLERANCE_MM = 0.3
@@ -125,6 +127,12 @@ class Samples:
     def rotation(self) -> np.ndarray:
         """From the camera of each to the surface's frame, float32 [N, 3, 3]."""
         return self.views.T_local_camera[:, :3, :3].astype(np.float32)[self.views.row(self.frame)]
+
+    def normals(self, surface: Surface) -> np.ndarray:
+        """Unit normals of the ``surface`` that they lie on, in the camera frame of each, float32 [N, 3]."""
+        corners = surface.normals[surface.triangles[self.triangle.numpy()]]
+        share = self.barycentric.numpy()
+        return unit(np.einsum("nk,nka,nab->nb", share, corners, self.rotation, optimize=True))
 
     def lit(self, n: float, q: float, log_scale: float = 0.0) -> Lit:
         """What lights the pixels, where the light's n and q and the albedo's scale say what is bounced."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
-from math import nan
 
 import numpy as np
 import scipy.sparse
@@ -19,8 +18,8 @@ from endotwin.surface import Surface
 from endotwin.surface.casting import Caster
 from endotwin.surface.vectors import dot, unit
 from endotwin.synth.trajectories import Trajectory
-from endotwin.synth.trajectories.orbit import wall_point
 from endotwin.synth.trajectories.trajectory import parse_options
+from endotwin.synth.trajectories.wall_point import WallPoint, wall_point
 from endotwin.twin import Twin
 from endotwin.twin.polyps import MOST_POLYPS
 
@@ -43,7 +42,7 @@ OFF_MM = 2.0
 
 
 @dataclass(frozen=True)
-class PolypOptions:
+class PolypOptions(WallPoint):
     """Options of a polyp of any class."""
 
     size: float = field(default=6.0, metadata={"help": "greatest diameter, of the head of a stalk, mm"})
@@ -52,12 +51,6 @@ class PolypOptions:
     ihb: float = field(
         default=2.9, metadata={"help": "index of haemoglobin above that of the wall", "signed": True}
     )
-    x: float = field(default=nan, metadata={"help": "place, world mm", "signed": True})
-    y: float = field(default=nan, metadata={"help": "place, world mm", "signed": True})
-    z: float = field(default=nan, metadata={"help": "place, world mm", "signed": True})
-    frame: int = field(default=0, metadata={"help": "or the place at pixel u, v of this frame"})
-    u: float = field(default=nan, metadata={"help": "pixel, to the right"})
-    v: float = field(default=nan, metadata={"help": "pixel, down"})
 
     @property
     def placed(self) -> bool:

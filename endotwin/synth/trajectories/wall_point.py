@@ -1,0 +1,51 @@
+"""A point of the wall, as options tell it: where it lies, or the pixel of a frame that shows it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from math import isnan, nan
+
+import numpy as np
+
+from endotwin.errors import EndotwinError
+from endotwin.surface.casting import Caster, surface_points
+from endotwin.twin import Twin
+
+
+@dataclass(frozen=True)
+class WallPoint:
+    """Options that tell a point of the wall."""
+
+    x: float = field(default=nan, metadata={"help": "the point, world mm", "signed": True})
+    y: float = field(default=nan, metadata={"help": "the point, world mm", "signed": True})
+    z: float = field(default=nan, metadata={"help": "the point, world mm", "signed": True})
+    frame: int = field(default=0, metadata={"help": "or the point at pixel u, v of this frame"})
+    u: float = field(default=nan, metadata={"help": "pixel, to the right"})
+    v: float = field(default=nan, metadata={"help": "pixel, down"})
+
+
+def wall_point(options: WallPoint, twin: Twin, what: str, error: type[EndotwinError]) -> np.ndarray:
+    """The point of the options of ``what``, float64 [3], world mm.
+
+    Raises:
+        error: none is given, or there is none at that pixel. SequenceError: the sequence is gone.
+    """
+    given = np.array([options.x, options.y, options.z])
+    if not np.isnan(given).any():
+        return given
+    if isnan(options.u) or isnan(options.v):
+        raise error(f"{what} needs its point: give x, y and z, or frame, u and v")
+    poses, camera = twin.sequence().T_world_camera, twin.camera
+    if options.frame >= len(poses):
+        raise error(f"{what}: there is no frame {options.frame}; the sequence has {len(poses)}")
+    mask = np.zeros((camera.height, camera.width), bool)
+    column, row = round(options.u), round(options.v)
+    if column >= camera.width or row >= camera.height:
+        raise error(
+            f"{what}: pixel {column}, {row} is outside of {camera.width}×{camera.height}; choose another"
+        )
+    mask[row, column] = True
+    hits = Caster(twin.surface, threads=1).cast(camera, poses[options.frame], mask)
+    if not len(hits):
+        raise error(f"{what}: pixel {column}, {row} of frame {options.frame} sees no surface; choose another")
+    return surface_points(twin.surface, hits)[0]
