@@ -1,13 +1,12 @@
-"""A reader of OpenEXR files that shares no code with the library: scan lines, ZIP or none ("OpenEXR File
-Layout", openexr.com)."""
+"""A reader of OpenEXR files that shares no code with the library: scan lines, run lengths or none ("OpenEXR
+File Layout", openexr.com)."""
 
 import struct
-import zlib
 
 import numpy as np
 
-LINES = {b"\0": 1, b"\3": 16}
-"""Scan lines of a block, by compression."""
+NONE, RLE = b"\0", b"\1"
+"""Compressions whose blocks are of one scan line each."""
 
 DTYPES = {1: np.dtype("<f2"), 2: np.dtype("<f4")}
 
@@ -22,20 +21,18 @@ def read(content: bytes) -> tuple[dict[str, bytes], dict[str, np.ndarray]]:
         (size,) = struct.unpack_from("<I", content, at)
         attributes[name.decode()] = content[at + 4 : at + 4 + size]
         at += 4 + size
-    of_block = LINES[attributes["compression"]]
+    assert attributes["compression"] in (NONE, RLE)
     left, top, right, bottom = struct.unpack("<4i", attributes["dataWindow"])
     width, height = right - left + 1, bottom - top + 1
     names = _channels(attributes["channels"])
     planes = {name: np.empty((height, width), dtype) for name, dtype in names.items()}
-    for offset in struct.unpack_from(f"<{-(-height // of_block)}Q", content, at + 1):
-        first, size = struct.unpack_from("<iI", content, offset)
-        lines = range(first - top, min(first - top + of_block, height))
-        expected = len(lines) * width * sum(dtype.itemsize for dtype in names.values())
-        block = _inflated(content[offset + 8 : offset + 8 + size], expected)
-        for line in lines:
-            for name, dtype in names.items():
-                row, block = block[: width * dtype.itemsize], block[width * dtype.itemsize :]
-                planes[name][line] = np.frombuffer(row, dtype)
+    for offset in struct.unpack_from(f"<{height}Q", content, at + 1):
+        line, size = struct.unpack_from("<iI", content, offset)
+        expected = width * sum(dtype.itemsize for dtype in names.values())
+        block = _spread(content[offset + 8 : offset + 8 + size], expected)
+        for name, dtype in names.items():
+            row, block = block[: width * dtype.itemsize], block[width * dtype.itemsize :]
+            planes[name][line - top] = np.frombuffer(row, dtype)
     return attributes, planes
 
 
@@ -48,11 +45,18 @@ def _channels(described: bytes) -> dict[str, np.dtype]:
     return channels
 
 
-def _inflated(block: bytes, size: int) -> bytes:
-    """The bytes of a block: inflated, summed up, its halves interleaved; stored where that is as small."""
+def _spread(block: bytes, size: int) -> bytes:
+    """The bytes of a block: runs spread out, summed up, its halves interleaved; stored where that is as
+    small."""
     if len(block) == size:
         return block
-    differences = np.frombuffer(zlib.decompress(block), np.uint8).astype(np.int64)
+    spread = bytearray()
+    while block:
+        (count,) = struct.unpack_from("b", block)
+        taken = 2 if count >= 0 else 1 - count
+        spread += block[1:2] * (count + 1) if count >= 0 else block[1:taken]
+        block = block[taken:]
+    differences = np.frombuffer(spread, np.uint8).astype(np.int64)
     differences[1:] -= 128
     summed = np.cumsum(differences).astype(np.uint8)
     mixed = np.empty(size, np.uint8)

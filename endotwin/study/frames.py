@@ -20,7 +20,8 @@ from endotwin.sequence import Sequence
 from endotwin.sequence.sequence import resized_depth
 from endotwin.study.accuracy import FARTHEST_MM
 from endotwin.study.corruptions import as_jpeg
-from endotwin.synth.encodings import decode_depth, pixels
+from endotwin.synth.containers import pixels
+from endotwin.synth.encodings import decode_depth
 from endotwin.synth.labels import MASK_UNSEEN
 
 COLOR, DEPTH, ASKED = "color.npy", "depth.npy", "asked.json"

@@ -5,34 +5,17 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from io import BytesIO
-from pathlib import Path
-from tempfile import TemporaryDirectory
 
-import cv2
 import numpy as np
-import OpenEXR
 import tifffile
 
 from endotwin.sequence.readers.c3vd import DEPTH_RANGE_MM
+from endotwin.synth.containers import channels, deflated_tiff, exr, npz, pixels, png, tiff
 
 FLOW_RANGE_PX = 20.0
 UINT16 = 65535
 FLOW_STEP_PX = 2 * FLOW_RANGE_PX / UINT16
 HALF_MAX = 65504.0
-
-# Measured on VGA frames of a fitted twin, one core:
-# PNG level 1, run lengths, filter of averages: 8 ms and 216 kB; with all filters tried: 14 ms and 207 kB.
-# TIFF of differences by tifffile, Deflate at level 1: depth 6 ms, 203 kB, flow 12 ms, 345 kB; by OpenCV,
-# which knows no levels, 17 ms, 203 kB and 45 ms, 289 kB. LZW is larger, and tifffile cannot read it without
-# further packages. Normals: Deflate of differences 60 ms, 1.25 MB; uncompressed 1 ms, 1.84 MB.
-# EXR: RGB as half floats with ZIP 19 ms, 848 kB; uncompressed 7 ms, 1.85 MB. Floats: ZIP takes 7 times as
-# long as no compression for an eighth less (scene flow 50 ms, 3.22 MB; 5 ms, 3.69 MB), and so does Deflate in
-# NPZ (vertices 148 ms, 3.29 MB; 2 ms, 3.69 MB).
-PNG = (
-    *(cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE),
-    *(cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_AVG),
-)
-DEFLATE = {"compression": "adobe_deflate", "predictor": True, "compressionargs": {"level": 1}}
 
 
 @dataclass(frozen=True)
@@ -88,29 +71,6 @@ def encode_flow(flow_px: np.ndarray) -> np.ndarray:
     return coded
 
 
-def rgb_order(image: np.ndarray) -> np.ndarray:
-    """The image as OpenCV writes it: blue first."""
-    return cv2.cvtColor(image, cv2.COLOR_RGB2BGR) if image.ndim == 3 else image
-
-
-def png(image: np.ndarray) -> bytes:
-    """A PNG file of an image uint8 or uint16, [H, W] or RGB [H, W, 3]."""
-    return cv2.imencode(".png", rgb_order(image), PNG)[1].tobytes()
-
-
-def tiff(image: np.ndarray, **compression) -> bytes:
-    """A TIFF file of an image uint16 or int32, [H, W] or RGB [H, W, 3]."""
-    file = BytesIO()
-    kind = "rgb" if image.ndim == 3 else "minisblack"
-    tifffile.imwrite(file, image, photometric=kind, metadata=None, **compression)
-    return file.getvalue()
-
-
-def pixels(content: bytes) -> np.ndarray:
-    """What ``png`` and ``tiff`` were given."""
-    return rgb_order(cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED))
-
-
 def decode_color(content: bytes) -> np.ndarray:
     """Values [...] of a file of 8 or 16 bits, in [0, 1]."""
     image = pixels(content)
@@ -134,33 +94,6 @@ def decode_flow(content: bytes) -> np.ndarray:
     raw = pixels(content)[..., :2]
     flow_px = raw / (UINT16 / 2 / FLOW_RANGE_PX) - FLOW_RANGE_PX
     return np.where((raw == 0).all(axis=-1, keepdims=True), np.nan, flow_px)
-
-
-def exr(**channels: np.ndarray) -> bytes:
-    """An OpenEXR file of float16 or float32 channels, [H, W] or, as ``RGB``, [H, W, 3]."""
-    halves = all(values.dtype == np.float16 for values in channels.values())
-    compression = OpenEXR.ZIP_COMPRESSION if halves else OpenEXR.NO_COMPRESSION
-    header = {"compression": compression, "type": OpenEXR.scanlineimage}
-    file = BytesIO()
-    OpenEXR.File(header, channels, num_threads=0).write(file)
-    return file.getvalue()
-
-
-def channels(content: bytes, *names: str) -> np.ndarray:
-    """Channels of what ``exr`` wrote, float64 [H, W], or [H, W, C] of several names or of ``RGB``."""
-    with TemporaryDirectory() as folder:  # OpenEXR reads files alone
-        path = Path(folder) / "image.exr"
-        path.write_bytes(content)
-        found = OpenEXR.File(str(path)).channels()
-    planes = [found[name].pixels.astype(np.float64) for name in names]
-    return planes[0] if len(planes) == 1 else np.stack(planes, axis=-1)
-
-
-def npz(**arrays: np.ndarray) -> bytes:
-    """An NPZ file of arrays by name; the same bytes at any time."""
-    file = BytesIO()
-    np.savez(file, **arrays)
-    return file.getvalue()
 
 
 def plane(image: np.ndarray, channel: int) -> np.ndarray:
@@ -230,7 +163,7 @@ ENCODINGS: dict[str, Encoding] = {
     ),
     "depth": Encoding(
         ".tiff",
-        lambda depth_mm: tiff(encode_depth(depth_mm), **DEFLATE),
+        lambda depth_mm: deflated_tiff(encode_depth(depth_mm)),
         "16-bit z-depth, raw / 65535 * 100 mm; 0: none; 65535: 100 mm up (clipped)",
         decode_depth,
         DEPTH_RANGE_MM / UINT16,
@@ -288,7 +221,7 @@ ENCODINGS: dict[str, Encoding] = {
     ),
     "flow": Encoding(
         ".tiff",
-        lambda flow_px: tiff(encode_flow(flow_px), **DEFLATE),
+        lambda flow_px: deflated_tiff(encode_flow(flow_px)),
         "16-bit, " + _FLOW.format(way=_BACK),
         decode_flow,
         FLOW_STEP_PX,
@@ -296,7 +229,7 @@ ENCODINGS: dict[str, Encoding] = {
     "flow_hidden": Encoding(".png", png, _HIDDEN.format(other="previous"), pixels),
     "flow_forward": Encoding(
         ".tiff",
-        lambda flow_px: tiff(encode_flow(flow_px), **DEFLATE),
+        lambda flow_px: deflated_tiff(encode_flow(flow_px)),
         "16-bit, " + _FLOW.format(way=_ON),
         decode_flow,
         FLOW_STEP_PX,
@@ -347,7 +280,7 @@ ENCODINGS: dict[str, Encoding] = {
     ),
     "triangles": Encoding(
         ".tiff",
-        lambda triangle: tiff(triangle, **DEFLATE),
+        deflated_tiff,
         "32-bit signed: index of the triangle in surface.ply, counted from 0; -1: none",
         lambda content: tifffile.imread(BytesIO(content)),
     ),

@@ -9,7 +9,7 @@ from typing import Self
 import cv2
 import numpy as np
 
-from endotwin.synth.encodings import FLOW_RANGE_PX, encode_color, rgb_order
+from endotwin.synth.encodings import FLOW_RANGE_PX, encode_color
 
 DEPTH_BINS_MM = np.linspace(0, 100, 51)
 BRIGHTNESS_BINS = np.linspace(0, 1, 33)
@@ -116,7 +116,8 @@ def thumbnail(images: dict[str, np.ndarray]) -> bytes:
     height, width = picture.shape[:2]
     size = (THUMBNAIL_PX, max(round(height * THUMBNAIL_PX / width), 1))
     small = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
-    return cv2.imencode(".jpg", rgb_order(small), (cv2.IMWRITE_JPEG_QUALITY, THUMBNAIL_QUALITY))[1].tobytes()
+    quality = (cv2.IMWRITE_JPEG_QUALITY, THUMBNAIL_QUALITY)
+    return cv2.imencode(".jpg", cv2.cvtColor(small, cv2.COLOR_RGB2BGR), quality)[1].tobytes()
 
 
 def _counts(values: np.ndarray, edges: np.ndarray) -> np.ndarray:

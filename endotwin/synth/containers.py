@@ -1,0 +1,108 @@
+"""PNG, TIFF, OpenEXR and NPZ files of images, in memory; the same bytes for the same image.
+
+Measured on VGA frames of a fitted twin, one core: 16-bit RGB as PNG, deflated by ISA-L, 8 ms and 1.27 MB, and
+by OpenCV's zlib 20 ms and 1.27 MB; flow as TIFF 4 ms and 410 kB, by zlib 15 ms and 433 kB. OpenEXR of half
+floats: run lengths 6 ms and 1.14 MB, ZIP 22 ms and .84 MB; of floats ZIP takes 7 times as long as no
+compression for an eighth less (scene flow 50 ms and 3.22 MB, 5 ms and 3.69 MB), as does Deflate in NPZ.
+"""
+
+from __future__ import annotations
+
+import struct
+from io import BytesIO
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import cv2
+import numpy as np
+import OpenEXR
+import tifffile
+from isal import isal_zlib
+
+LEVEL = 1
+"""Of ISA-L's Deflate, which at levels 0 to 3 differ by a tenth in size."""
+
+SIGNATURE = b"\x89PNG\r\n\x1a\n"
+GREY, RGB = 0, 2
+UP = 2
+"""PNG's codes of colour, and of a row that is written as its difference from the one above."""
+
+
+def png(image: np.ndarray) -> bytes:
+    """A PNG file of an image uint8 or uint16, [H, W] or RGB [H, W, 3] (ISO/IEC 15948)."""
+    height, width = image.shape[:2]
+    values = image.astype(image.dtype.newbyteorder(">"), order="C").view(np.uint8).reshape(height, -1)
+    rows = np.empty((height, 1 + values.shape[1]), np.uint8)
+    rows[:, 0], rows[0, 1:] = UP, values[0]
+    np.subtract(values[1:], values[:-1], out=rows[1:, 1:])
+    head = struct.pack(
+        ">IIBBBBB", width, height, 8 * image.itemsize, RGB if image.ndim == 3 else GREY, 0, 0, 0
+    )
+    chunks = ((b"IHDR", head), (b"IDAT", isal_zlib.compress(rows, LEVEL)), (b"IEND", b""))
+    return SIGNATURE + b"".join(_chunk(*each) for each in chunks)
+
+
+def _chunk(kind: bytes, content: bytes) -> bytes:
+    """A chunk of a PNG file: its length, its kind, its content, and a sum to check them by."""
+    check = isal_zlib.crc32(content, isal_zlib.crc32(kind))
+    return b"".join((struct.pack(">I", len(content)), kind, content, struct.pack(">I", check)))
+
+
+def tiff(image: np.ndarray) -> bytes:
+    """A TIFF file of an image uint16 or int32, [H, W] or RGB [H, W, 3]."""
+    return _tiff(image)
+
+
+def deflated_tiff(image: np.ndarray) -> bytes:
+    """As ``tiff``, deflated, as differences along the rows."""
+    steps = image.copy()
+    steps[:, 1:] -= image[:, :-1]
+    strip = isal_zlib.compress(steps, LEVEL)
+    return _tiff(
+        iter([strip]),
+        shape=image.shape,
+        dtype=image.dtype,
+        rowsperstrip=len(image),
+        compression="adobe_deflate",
+        predictor=True,
+    )
+
+
+def _tiff(image, **layout) -> bytes:
+    file = BytesIO()
+    kind = "rgb" if len(layout.get("shape", np.shape(image))) == 3 else "minisblack"
+    tifffile.imwrite(file, image, photometric=kind, metadata=None, **layout)
+    return file.getvalue()
+
+
+def pixels(content: bytes) -> np.ndarray:
+    """What ``png`` and ``tiff`` were given."""
+    image = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
+    return cv2.cvtColor(image, cv2.COLOR_BGR2RGB) if image.ndim == 3 else image
+
+
+def exr(**channels: np.ndarray) -> bytes:
+    """An OpenEXR file of float16 or float32 channels, [H, W] or, as ``RGB``, [H, W, 3]."""
+    halves = all(values.dtype == np.float16 for values in channels.values())
+    compression = OpenEXR.RLE_COMPRESSION if halves else OpenEXR.NO_COMPRESSION
+    header = {"compression": compression, "type": OpenEXR.scanlineimage}
+    file = BytesIO()
+    OpenEXR.File(header, channels, num_threads=0).write(file)
+    return file.getvalue()
+
+
+def channels(content: bytes, *names: str) -> np.ndarray:
+    """Channels of what ``exr`` wrote, float64 [H, W], or [H, W, C] of several names or of ``RGB``."""
+    with TemporaryDirectory() as folder:  # OpenEXR reads files alone
+        path = Path(folder) / "image.exr"
+        path.write_bytes(content)
+        found = OpenEXR.File(str(path)).channels()
+    planes = [found[name].pixels.astype(np.float64) for name in names]
+    return planes[0] if len(planes) == 1 else np.stack(planes, axis=-1)
+
+
+def npz(**arrays: np.ndarray) -> bytes:
+    """An NPZ file of arrays by name; the same bytes at any time."""
+    file = BytesIO()
+    np.savez(file, **arrays)
+    return file.getvalue()
