@@ -23,7 +23,6 @@ from endotwin.surface import Surface
 from endotwin.surface.casting import Caster, surface_points
 from endotwin.synth import LABELS, Trajectory, Variation, parse_labels, synthesize
 from endotwin.synth.encodings import ENCODINGS, encode_flow, encode_normals
-from endotwin.synth.flow import projected, seen_from
 from endotwin.synth.labels import (
     HIDDEN_NO,
     HIDDEN_NONE,
@@ -221,18 +220,6 @@ def test_filled_surface_is_told_from_unseen(folded):
     surface = replace(twin.surface, filled=s > 0.6, seen_by=np.where(s > 0.6, 0, twin.surface.seen_by))
     mask = labelled(replace(twin, surface=surface), poses, twin.camera).frame(0)["mask"]
     assert set(np.unique(mask)) == {MASK_NONE, MASK_FILLED, MASK_VALID}
-
-
-def test_a_hidden_point_is_one_that_a_ray_does_not_reach(folded):
-    twin, poses = folded
-    caster = Caster(twin.surface)
-    hits = caster.cast(twin.camera, poses[0])
-    points = surface_points(twin.surface, hits)
-    uv = projected(points, twin.camera, poses[0])
-    assert seen_from(points, uv, caster, twin.camera, poses[0]).mean() > 0.999
-    turned = poses[0] @ np.diag([-1.0, 1, -1, 1])
-    uv = projected(points, twin.camera, turned)
-    assert not seen_from(points, uv, caster, twin.camera, turned).any()
 
 
 def test_flow_beyond_20_px_and_none_are_0_and_the_rest_reads_back():

@@ -32,6 +32,9 @@ FACING = 0.05
 """Least cosine between normal and ray of a surface that shows its colour. At the rim of a fold less of it
 than a hundredth of a pixel is steeper: what is there in a mesh is the back of a sliver, a black dot."""
 
+RUN_PX = 64
+"""Pixels in a row that are sooner copied at once than one by one."""
+
 
 @dataclass(frozen=True, eq=False)
 class Rays:
@@ -95,10 +98,14 @@ class View:
 
 def laid_out(values: np.ndarray, pixel: np.ndarray, shape: tuple[int, int], empty: float = 0.0) -> np.ndarray:
     """Values [N, ...] of row-major pixels [N] as an image [H, W, ...] with ``empty`` elsewhere."""
-    rows = np.concatenate([values, np.full((1, *values.shape[1:]), empty, values.dtype)])
-    row = np.full(shape[0] * shape[1], len(values), np.int32)
-    row[pixel] = np.arange(len(values))
-    return rows.take(row, axis=0).reshape(*shape, *values.shape[1:])
+    image = np.full((shape[0] * shape[1], *values.shape[1:]), empty, values.dtype)
+    starts = np.flatnonzero(np.diff(pixel, prepend=-2) != 1)
+    if len(starts) * RUN_PX >= len(pixel):
+        image[pixel] = values
+    else:
+        for start, end in zip(starts, np.append(starts[1:], len(pixel)), strict=True):
+            image[pixel[start] : pixel[start] + end - start] = values[start:end]
+    return image.reshape(*shape, *values.shape[1:])
 
 
 class Renderer:
@@ -174,13 +181,15 @@ class Renderer:
         mask: np.ndarray | None = None,
         exposure: float = 1.0,
         like: View | None = None,
+        hits: Correspondences | None = None,
     ) -> View:
         """The view from ``T_world_camera`` [4, 4], of the pixels in ``mask`` [H, W] if given.
 
         Colours of pixels at silhouettes and shadow edges (and of those beside the mask's edge), and only
         those, are means over the pixel's area; labels are of its centre. ``exposure`` is a factor on the
         radiance of this view. ``like`` is a view from there by a renderer of the same twin with other lobes,
-        through the same camera: what its rays met, and how that is lit, is not looked for again.
+        through the same camera: what its rays met, and how that is lit, is not looked for again. ``hits`` are
+        what the rays through the pixels' centres meet, if that is known.
 
         Raises:
             TrajectoryError: that is no rigid pose. OptionError: the mask has another shape than the image.
@@ -190,7 +199,7 @@ class Renderer:
         if mask is not None and np.shape(mask) != shape:
             raise OptionError(f"the mask has the shape {np.shape(mask)}, but the image {shape}")
         light = self._illumination.at(T_world_camera)
-        met = like._met if like else self._met(light, T_world_camera, mask)
+        met = like._met if like else self._met(light, T_world_camera, mask, hits)
         radiance = laid_out(met.centres.radiance(light), met.centres.hits.pixel, shape)
         mean, count = met.mean_radiance(light)
         radiance[met.edges] = np.where(count[:, None] > 0, mean, radiance[met.edges])
@@ -225,10 +234,18 @@ class Renderer:
         """Bool [H, W]: pixels through which the lens sees at all."""
         return np.isfinite(self.camera.pixel_directions).all(axis=2)
 
-    def _met(self, light: ViewLight, T_world_camera: np.ndarray, mask: np.ndarray | None) -> _Met:
+    def _met(
+        self,
+        light: ViewLight,
+        T_world_camera: np.ndarray,
+        mask: np.ndarray | None,
+        hits: Correspondences | None,
+    ) -> _Met:
         """What the rays of a view meet."""
         shape = (self.camera.height, self.camera.width)
-        centres = self._cast(self.camera, light, T_world_camera, mask)
+        if hits is None:
+            hits = self.caster.cast(self.camera, T_world_camera, mask)
+        centres = self._points(self.camera, hits, light, T_world_camera)
         pixel = centres.hits.pixel
         distance_mm = laid_out(centres.hits.distance_mm, pixel, shape)
         told = laid_out(centres.facing, pixel, shape)
@@ -240,16 +257,12 @@ class Renderer:
         offsets = np.stack(np.meshgrid(inside, inside), axis=-1).reshape(-1, 2)
         uv = np.argwhere(edges)[:, ::-1]
         rays = Rays(self.camera.directions(uv[:, None] + offsets).astype(np.float32))
-        return _Met(centres, told, edges, self._cast(rays, light, T_world_camera))
+        within = self._points(rays, self.caster.cast(rays, T_world_camera), light, T_world_camera)
+        return _Met(centres, told, edges, within)
 
-    def _cast(
-        self,
-        rays: Camera | Rays,
-        light: ViewLight,
-        T_world_camera: np.ndarray,
-        mask: np.ndarray | None = None,
+    def _points(
+        self, rays: Camera | Rays, hits: Correspondences, light: ViewLight, T_world_camera: np.ndarray
     ) -> _Points:
-        hits = self.caster.cast(rays, T_world_camera, mask)
         mixed = hits.interpolate(self.twin.surface, self._normal_and_material)
         normals = to_camera(mixed[:, :3], T_world_camera)
         facing = -dot(normals, rays.pixel_directions.reshape(-1, 3).take(hits.pixel, axis=0)) > FACING

@@ -15,11 +15,10 @@ from endotwin.render import Renderer, View
 from endotwin.render.renderer import laid_out
 from endotwin.run.streams import Stream
 from endotwin.surface import Surface
-from endotwin.surface.casting import Correspondences, surface_points
-from endotwin.synth.flow import flow_to, hides_surface, projected, seen_from
+from endotwin.surface.casting import surface_points
 from endotwin.synth.job import Job
-from endotwin.synth.motion import Body
 from endotwin.synth.photograph import photographed
+from endotwin.synth.sight import Sights
 from endotwin.twin.polyps import numbered
 
 MASK_NONE, MASK_FILLED, MASK_UNSEEN, MASK_VALID = 0, 64, 128, 255
@@ -104,11 +103,11 @@ def triangle_kinds(surface: Surface) -> np.ndarray:
 
 
 class Labeller:
-    """Labels the frames of a job; keeps rays of the latest frames, and the renderer of the latest draw."""
+    """Labels the frames of a job; keeps what the latest ones see, and the renderer of the latest draw."""
 
     def __init__(self, job: Job):
         self._job = job
-        self._body = Body(job.twin.surface, job.motion, job.trajectory.timestamps_s)
+        self._sights = Sights(job.twin.surface, job.motion, job.trajectory, job.camera)
         self._kinds = triangle_kinds(job.twin.surface)
         self._polyps = numbered((each.triangles for each in job.twin.polyps), len(job.twin.surface.triangles))
         self._T_world_next = following(job.trajectory.T_world_camera)
@@ -124,7 +123,7 @@ class Labeller:
         if SHADED & set(job.labels):
             renderer, specular_free = self.renderers(index)
         if (PHOTOS | {"specular"}) & set(job.labels):
-            view = renderer.view(T_world_camera)
+            view = renderer.view(T_world_camera, hits=self._sights[index].hits)
         if PHOTOS & set(job.labels):
             generator = Stream.SENSOR.generator(job.document["seed"], index)
             color, radiance = photographed(
@@ -132,15 +131,14 @@ class Labeller:
             )
             images = {"rgb": color, "rgb_linear": radiance, "rgb_exr": radiance}
         if specular_free is not None:
-            matt = specular_free.view(T_world_camera, like=view)
+            matt = specular_free.view(T_world_camera, like=view, hits=self._sights[index].hits)
             images["diffuse"] = matt.color
             if "specular" in job.labels:
                 images["specular"] = view.color - matt.color
                 red, green, blue = np.moveaxis(images["specular"] > HIGHLIGHT, 2, 0)
                 images["highlights"] = np.uint8(255) * (red & green & blue)
             view = view or matt
-        hits = view.hits if view else self._body.at(index).cast(job.camera, T_world_camera)
-        geometry = _Geometry(job, self._body, hits, index, self._kinds, self._polyps, renderer, view)
+        geometry = _Geometry(job, self._sights, index, self._kinds, self._polyps, renderer, view)
         for name in job.images:
             if name not in images:
                 images[name] = getattr(geometry, name)
@@ -153,7 +151,7 @@ class Labeller:
         if kept is None or kept[0] != draw:
             twin, exposure = draw.edited(self._job.twin, self._job.regions)
             if kept is None:
-                renderer = Renderer(twin, self._job.camera, caster=self._body.at_rest, exposure=exposure)
+                renderer = Renderer(twin, self._job.camera, caster=self._sights.at_rest, exposure=exposure)
             else:
                 renderer = kept[1].edited(twin, exposure)
             specular_free = None
@@ -163,8 +161,8 @@ class Labeller:
                 specular_free = renderer.edited(matt, exposure)
             kept = self._shaded = (draw, renderer, specular_free)
         renderers = kept[1:]
-        if self._body.moves:
-            caster = self._body.at(index)
+        if self._sights.move:
+            caster = self._sights[index].caster
             renderers = tuple(renderer and renderer.moved(caster) for renderer in renderers)
         if self._job.gains is None:
             return renderers
@@ -177,20 +175,19 @@ class _Geometry:
     def __init__(
         self,
         job: Job,
-        body: Body,
-        hits: Correspondences,
+        sights: Sights,
         index: int,
         kinds: np.ndarray,
         polyps: np.ndarray,
         renderer: Renderer | None,
         view: View | None,
     ):
-        self._job, self._body, self._hits, self._index = job, body, hits, index
-        self._caster = body.at(index)
+        self._job, self._sights, self._index = job, sights, index
+        self._sight = sights[index]
+        self._hits = self._sight.hits
         self._others: dict[int, np.ndarray] = {}
         self._places: dict[int, np.ndarray] = {}
         self._kinds, self._polyps, self._renderer, self._view = kinds, polyps, renderer, view
-        self._T_world_camera = job.trajectory.T_world_camera[index]
 
     def _image(self, values: np.ndarray, empty: float = 0.0) -> np.ndarray:
         shape = (self._job.camera.height, self._job.camera.width)
@@ -216,8 +213,9 @@ class _Geometry:
     def normals(self) -> np.ndarray:
         if self._view:
             return self._view.normals
-        surface = self._caster.surface
-        return self._image(to_camera(self._hits.interpolate(surface, surface.normals), self._T_world_camera))
+        surface = self._sight.surface
+        normals = self._hits.interpolate(surface, surface.normals)
+        return self._image(to_camera(normals, self._sight.T_world_camera))
 
     @property
     def albedo(self) -> np.ndarray:
@@ -252,8 +250,7 @@ class _Geometry:
 
     @property
     def occlusion(self) -> np.ndarray:
-        hides = hides_surface(self._points, self._hits, self._caster, self._T_world_camera)
-        return self._image(np.where(hides, np.uint8(255), np.uint8(0)))
+        return self._image(np.where(self._sight.hides_surface(), np.uint8(255), np.uint8(0)))
 
     @cached_property
     def flow(self) -> np.ndarray:
@@ -276,12 +273,12 @@ class _Geometry:
 
     @cached_property
     def _points(self) -> np.ndarray:
-        return surface_points(self._caster.surface, self._hits)
+        return surface_points(self._sight.surface, self._hits)
 
     def _points_at(self, index: int) -> np.ndarray:
         """Where the points of the hits are in another frame, world, float64 [N, 3]."""
-        surface = self._body.at(index).surface
-        if surface is self._caster.surface:
+        surface = self._sights[index].surface
+        if surface is self._sight.surface:
             return self._points
         if index not in self._others:
             self._others[index] = surface_points(surface, self._hits)
@@ -297,37 +294,32 @@ class _Geometry:
 
     @property
     def vertices(self) -> np.ndarray:
-        surface = self._caster.surface
+        surface = self._sight.surface
         return surface.vertices_mm + surface.origin_mm
 
     def _scene_flow(self, index: int) -> np.ndarray:
-        if self._other(index) is None:
+        if not self._exists(index):
             return self._image(np.full((len(self._hits), 3), np.nan, np.float32), np.nan)
         return self._image((self._points_at(index) - self._points).astype(np.float32), np.nan)
 
-    def _other(self, index: int) -> np.ndarray | None:
-        """The pose of another frame; None where there is none."""
-        poses = self._job.trajectory.T_world_camera
-        return poses[index] if 0 <= index < len(poses) else None
+    def _exists(self, index: int) -> bool:
+        return 0 <= index < len(self._job.trajectory.T_world_camera)
 
     def _uv_at(self, index: int) -> np.ndarray:
         """Where the points of the hits lie in another frame's image, px, float64 [N, 2]."""
         if index not in self._places:
-            points = self._points_at(index)
-            self._places[index] = projected(points, self._job.camera, self._other(index))
+            self._places[index] = self._sights[index].places(self._points_at(index))
         return self._places[index]
 
     def _flow(self, index: int) -> np.ndarray:
-        if self._other(index) is None:
+        if not self._exists(index):
             return self._image(np.full((len(self._hits), 2), np.nan, np.float32), np.nan)
-        flow_px = flow_to(self._uv_at(index), self._hits.pixel, self._job.camera)
+        v, u = np.divmod(self._hits.pixel, self._job.camera.width)
+        flow_px = self._uv_at(index) - np.stack([u, v], axis=1)
         return self._image(flow_px.astype(np.float32), np.nan)
 
     def _hidden(self, index: int) -> np.ndarray:
-        T_world_other = self._other(index)
-        if T_world_other is None:
+        if not self._exists(index):
             return self._image(np.full(len(self._hits), HIDDEN_NONE, np.uint8), HIDDEN_NONE)
-        there = self._body.at(index)
-        points, uv = self._points_at(index), self._uv_at(index)
-        seen = seen_from(points, uv, there, self._job.camera, T_world_other)
+        seen = self._sights[index].shows(self._points_at(index), self._uv_at(index))
         return self._image(np.where(seen, np.uint8(HIDDEN_NO), np.uint8(HIDDEN_YES)), HIDDEN_NONE)

@@ -6,7 +6,6 @@ import logging
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
-from threading import local
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -14,7 +13,6 @@ from scipy.spatial.transform import Rotation
 
 from endotwin.errors import OptionError, TrajectoryError
 from endotwin.surface import Surface
-from endotwin.surface.casting import Caster
 from endotwin.synth.motion.crossing import crossings
 from endotwin.synth.motion.kinds import KINDS, Breathing, Peristalsis
 from endotwin.synth.motion.tube import Line, Places, moved, turned
@@ -40,9 +38,6 @@ that do at rest: a fused mesh has slivers, and layers that nearly touch."""
 
 PART = 1 << 14
 """Vertices that are moved at once: what is made on the way stays in the cache, in a third of the time."""
-
-KEPT = 3
-"""Surfaces that are kept: of a frame and its neighbours."""
 
 NEAR = 3.0
 """Wall within so many radii of the lumen is searched for what is nearest to a camera."""
@@ -167,43 +162,6 @@ class Motion:
             return pose, np.inf
         wall = moved(self.rest.vertices_mm[near], self.places[near], shift, M)
         return pose, float(np.linalg.norm(wall - (pose[:3, 3] - self.rest.origin_mm), axis=1).min())
-
-
-class Body:
-    """Rays into the surface of a dataset's frames: one surface at rest, or one a frame."""
-
-    def __init__(self, rest: Surface, motion: Motion | None, times_s: np.ndarray):
-        self._motion, self._times_s = motion, times_s
-        self._still = Caster(rest, threads=1)
-        self._kept = local()  # a thread's own: another's rays are under way in its casters
-
-    @property
-    def moves(self) -> bool:
-        """Whether frames have surfaces of their own."""
-        return self._motion is not None
-
-    @property
-    def at_rest(self) -> Caster:
-        """Rays into the surface at rest."""
-        return self._still
-
-    def at(self, index: int) -> Caster:
-        """Rays into the surface of frame ``index``; those of the latest frames are kept."""
-        if self._motion is None:
-            return self._still
-        time_s = float(self._times_s[index])
-        casters = vars(self._kept).setdefault("casters", {})
-        caster = casters.pop(time_s, None)
-        if caster is None:
-            caster = self._unused(casters).moved(self._motion.surface(time_s))
-        casters[time_s] = caster
-        return caster
-
-    def _unused(self, casters: dict[float, Caster]) -> Caster:
-        """A caster whose place another may take: a new one, or that of the frame asked for longest ago."""
-        if len(casters) < KEPT:
-            return Caster(self._still.surface, threads=1)
-        return casters.pop(next(iter(casters)))
 
 
 def parse_motion(specs: Iterable[str] | str, twin: Twin) -> Motion | None:

@@ -6,9 +6,9 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from endotwin.synth.flow import OCCLUSION_RANGE_MM
 from endotwin.synth.proof.warp import Frame, Landing, Sampled, landing, sampled
 from endotwin.synth.proof.within import FLOWS, Judged
+from endotwin.synth.sight import OCCLUSION_RANGE_MM
 
 SEEN, HIDDEN = 0, 255
 BEHIND_MM = 0.5

@@ -8,8 +8,8 @@ from functools import cached_property
 import numpy as np
 
 from endotwin.surface.silhouettes import discontinuities
-from endotwin.synth.flow import to_camera_frame
 from endotwin.synth.proof.written import Written
+from endotwin.synth.sight import to_camera_frame
 
 FLOAT_STEP = 4e-7
 """Relative step of depth that was kept as float32, with the float32 ray that it was taken along."""
