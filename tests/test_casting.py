@@ -7,7 +7,7 @@ import pytest
 import scenes
 
 from endotwin.fusion._open3d import o3c, o3d
-from endotwin.surface import Surface, refit
+from endotwin.surface import Surface, embree
 from endotwin.surface.casting import Caster
 
 
@@ -65,7 +65,7 @@ def swollen(surface: Surface, share: float) -> Surface:
 @pytest.mark.parametrize("known", [True, False], ids=["refitted", "built anew"])
 def test_a_moved_casters_hits_are_those_of_a_new_one_whatever_it_was_before(surface, known, monkeypatch):
     if not known:
-        monkeypatch.setattr(refit, "_library", lambda: None)
+        monkeypatch.setattr(embree, "library", lambda: None)
     origins, directions = random_rays(50_000)
     caster = Caster(surface)
     for share in (0.3, -0.2, 0.1):
@@ -170,3 +170,44 @@ def test_hits_are_the_same_far_from_the_origin(surface):
         Caster(sphere_surface(centre_mm=1e6)).cast(camera, far),
     )
     np.testing.assert_allclose(far_hits.distance_mm, near_hits.distance_mm, atol=1e-4)
+
+
+@pytest.mark.parametrize("camera", [scenes.pinhole(), scenes.omni()], ids=["pinhole", "omni"])
+@pytest.mark.parametrize("scale", [1, 0.37], ids=["whole squares", "parts of squares"])
+@pytest.mark.parametrize("moved", [False, True])
+def test_a_picture_in_packets_is_that_of_single_rays(surface, camera, scale, moved):
+    T, camera = scenes.look((1.13, 0.21, -0.37), (0.031, 0.1, 1)), camera.scaled(scale)
+    half = replace(surface, triangles=surface.triangles[::2])
+    caster = Caster(half, threads=1)
+    if moved:
+        caster = caster.moved(swollen(half, 0.2))
+    assert caster._packets is not None
+    found = caster.cast(camera, T)
+    everywhere = np.isfinite(camera.pixel_directions).all(axis=2)
+    expected = caster.cast(camera, T, everywhere)
+    assert 0.3 < len(found) / everywhere.sum() < 0.7
+    np.testing.assert_array_equal(found.pixel, expected.pixel)
+    assert (found.triangle != expected.triangle).mean() < 1e-3
+    np.testing.assert_allclose(found.distance_mm, expected.distance_mm, rtol=1e-5)
+    same = found.triangle == expected.triangle
+    np.testing.assert_allclose(found.barycentric[same], expected.barycentric[same], atol=1e-4)
+
+
+@pytest.mark.parametrize("threads", [1, 2], ids=["packets", "single rays"])
+def test_what_is_hidden_behind_a_hit_is_what_a_ray_from_there_meets(surface, threads):
+    """Two spheres, one within the other: the inner one hides the outer one, as far as the camera reaches."""
+    outer = surface.vertices_mm * 2
+    count = len(surface.vertices_mm)
+    both = Surface.from_mesh(
+        np.concatenate([surface.vertices_mm, outer]),
+        np.concatenate([surface.triangles[::2], surface.triangles + count]),
+        np.concatenate([surface.normals, surface.normals]),
+    )
+    caster, camera, T = Caster(both, threads), scenes.pinhole(), np.eye(4)
+    hits = caster.cast(camera, T)
+    inner = hits.triangle < len(surface.triangles[::2])
+    assert 0.3 < inner.mean() < 0.7
+    np.testing.assert_array_equal(caster.hides(camera, T, hits, 0.01, 100), inner)
+    radius_mm = np.linalg.norm(surface.vertices_mm[0])
+    assert not caster.hides(camera, T, hits, 0.01, 1.5 * radius_mm).any()
+    assert not caster.hides(camera, T, hits, 1.5 * radius_mm, 100).any()

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from copy import copy
 from dataclasses import dataclass, fields
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -15,6 +16,7 @@ from torch.nn.functional import embedding_bag
 
 from endotwin.cameras.base import Camera
 from endotwin.run.threads import THREADS
+from endotwin.surface.packets import Packets
 from endotwin.surface.refit import Refit
 from endotwin.surface.surface import Surface
 
@@ -86,6 +88,7 @@ class Caster:
         """The same scene, cast into by so many threads."""
         other = copy(self)
         other._threads = threads
+        vars(other).pop("_packets", None)
         return other
 
     def moved(self, surface: Surface) -> Caster:
@@ -134,6 +137,8 @@ class Caster:
     ) -> Correspondences:
         """Correspondences of the view from ``T_world_camera`` [4, 4], of the pixels in ``mask`` [H, W] if
         given."""
+        if mask is None and self._packets is not None:
+            return self._picture(camera, T_world_camera)
         T_local_camera = self.surface.to_local(T_world_camera).astype(np.float32)
         directions = camera.pixel_directions.reshape(-1, 3)
         centre = np.tile(T_local_camera[:3, 3], (RAYS_PER_TASK, 1))
@@ -146,6 +151,57 @@ class Caster:
         found = Correspondences(chosen.astype(np.int32), *self._first_hits(rays, len(chosen)))
         hit = np.flatnonzero(found.triangle >= 0)
         return found if len(hit) == len(found) else found[hit]
+
+    def hides(
+        self,
+        camera: Camera,
+        T_world_camera: np.ndarray,
+        hits: Correspondences,
+        gap_mm: float,
+        reach_mm: float,
+    ) -> np.ndarray:
+        """Bool [N]: hits of the view from ``T_world_camera`` [4, 4] with more surface on the same ray, more
+        than ``gap_mm`` behind them and within ``reach_mm`` of the camera."""
+        from_mm = hits.distance_mm + np.float32(gap_mm)
+        if self._packets is None:
+            T_local_camera = self.surface.to_local(T_world_camera).astype(np.float32)
+            rays = camera.pixel_directions.reshape(-1, 3).take(hits.pixel, axis=0) @ T_local_camera[:3, :3].T
+            origins = T_local_camera[:3, 3] + from_mm[:, None] * rays
+            return ~self.unobstructed(origins, rays, np.maximum(reach_mm - from_mm, 0))
+        centre, rays, valid = self._rays(camera, T_world_camera)
+        near_mm = np.full(valid.shape, np.inf, np.float32)
+        near_mm.reshape(-1)[hits.pixel] = from_mm
+        valid &= near_mm < reach_mm
+        met = valid & ~self._packets.clear(centre, rays, near_mm, reach_mm, valid)
+        return met.reshape(-1).take(hits.pixel)
+
+    @cached_property
+    def _packets(self) -> Packets | None:
+        """Those of its scene; None where they cannot be had, and for several threads, in whose way their many
+        short calls would be."""
+        if self._threads > 1 or not len(self.surface.triangles):
+            return None
+        return Packets.of(self._scene, self._device)
+
+    def _rays(self, camera: Camera, T_world_camera: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Of a camera's pixels, in the surface's frame: their origin float32 [3], directions float32 [H, W,
+        3], and which are finite, bool [H, W]."""
+        T_local_camera = self.surface.to_local(T_world_camera).astype(np.float32)
+        rays = camera.pixel_directions @ T_local_camera[:3, :3].T
+        return T_local_camera[:3, 3], rays, np.isfinite(rays[..., 0] + rays[..., 1] + rays[..., 2])
+
+    def _picture(self, camera: Camera, T_world_camera: np.ndarray) -> Correspondences:
+        """What ``cast`` returns, of all pixels."""
+        centre, rays, valid = self._rays(camera, T_world_camera)
+        found = [image.reshape(-1) for image in self._packets.first_hits(centre, rays, valid)]
+        missed = np.flatnonzero(valid.reshape(-1) & (found[0] < 0))
+        nudged = rays.reshape(-1, 3)[missed] + NUDGE
+        again = self._scene.run(np.tile(centre, (len(missed), 1)), nudged, output=True)
+        for image, name in zip(found, ("primID", "u", "v", "tfar"), strict=True):
+            image[missed] = again[name]
+        hit = np.flatnonzero(found[0] >= 0).astype(np.int32)
+        triangle, u, v, distance_mm = (image.take(hit) for image in found)
+        return Correspondences(hit, triangle, _barycentric(u, v), distance_mm)
 
     def _first_hits(
         self, rays: Callable[[slice], tuple[np.ndarray, np.ndarray]], count: int
@@ -185,11 +241,16 @@ class Caster:
             for name in ("primID", "u", "v", "tfar"):
                 found[name][missed] = again[name]
             missed = missed[again["primID"] < 0]
-        u = np.clip(found["u"], 0, 1)
-        v = np.clip(found["v"], 0, 1 - u)
-        barycentric = np.stack([1 - u - v, u, v], axis=1)
+        barycentric = _barycentric(found["u"], found["v"])
         barycentric[missed], found["tfar"][missed] = 0, np.inf
         return found["primID"], barycentric, found["tfar"]
+
+
+def _barycentric(u: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """Weights float32 [N, 3] of a triangle's vertices, of Embree's u and v."""
+    u = np.clip(u, 0, 1)
+    v = np.clip(v, 0, 1 - u)
+    return np.stack([1 - u - v, u, v], axis=1)
 
 
 def _finite(

@@ -79,11 +79,8 @@ class Sight:
     def hides_surface(self) -> np.ndarray:
         """Bool [N]: hits with more surface behind them on the same ray, within OCCLUSION_RANGE_MM of the
         camera (C3VD's occlusion)."""
-        rays = self._camera.pixel_directions.reshape(-1, 3).take(self.hits.pixel, axis=0)
-        rays = rays @ self.T_world_camera[:3, :3].T.astype(np.float32)
-        gone_mm = self.hits.distance_mm + np.float32(BEHIND_MM)
-        behind = self._centre + gone_mm[:, None] * rays
-        return ~self.caster.unobstructed(behind, rays, OCCLUSION_RANGE_MM - gone_mm)
+        view = self._camera, self.T_world_camera, self.hits
+        return self.caster.hides(*view, BEHIND_MM, OCCLUSION_RANGE_MM)
 
     @property
     def _centre(self) -> np.ndarray:
