@@ -24,7 +24,7 @@ def folded() -> tuple[Twin, Trajectory]:
 
 
 def by_rays(sight: Sight, points: np.ndarray, uv: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """Which points a ray from the camera reaches, and which are in the picture."""
+    """Which world points [N, 3] a ray from the camera reaches, and which are in the picture."""
     towards = points - sight.T_world_camera[:3, 3]
     distance_mm = np.sqrt(dot(towards, towards))
     centre = sight.T_world_camera[:3, 3] - sight.surface.origin_mm
@@ -46,11 +46,14 @@ def test_points_are_shown_that_rays_reach(folded, moving, scale):
     for one, other in ((0, 1), (1, 0), (2, 3), (4, 2)):
         there = sights[other]
         points = surface_points(there.surface, sights[one].hits)
-        uv = there.places(points)
+        towards = there.towards(sights[one].hits)
+        np.testing.assert_allclose(towards, points - there.T_world_camera[:3, 3], atol=1e-5)
+        uv = there.places(towards)
+        in_camera = (points - there.T_world_camera[:3, 3]) @ there.T_world_camera[:3, :3]
+        np.testing.assert_allclose(uv, camera.project(in_camera), atol=1e-6 * camera.width, rtol=1e-5)
         expected = by_rays(there, points, uv, (camera.width, camera.height))
         assert 0.02 < (~expected).mean() < 0.9
-        wrong += (there.shows(points, uv) != expected).sum()
-        towards = points - there.T_world_camera[:3, 3]
+        wrong += (there.shows(towards, uv) != expected).sum()
         _, known = there._at_a_glance(*uv.T, np.sqrt(dot(towards, towards)))
         glances.append(known[expected].mean())
         points_seen += len(points)
@@ -62,11 +65,11 @@ def test_points_are_shown_that_rays_reach(folded, moving, scale):
 def test_no_point_behind_the_camera_or_without_a_place_is_shown(folded):
     twin, trajectory = folded
     sight = Sight(Caster(twin.surface), twin.camera, trajectory.T_world_camera[0])
-    points = surface_points(twin.surface, sight.hits)
-    assert sight.shows(points, sight.places(points)).mean() > 0.999
+    towards = sight.towards(sight.hits)
+    assert sight.shows(towards, sight.places(towards)).mean() > 0.999
     turned = Sight(sight.caster, twin.camera, sight.T_world_camera @ np.diag([-1.0, 1, -1, 1]))
-    uv = turned.places(points)
-    assert np.isnan(uv).all() and not turned.shows(points, uv).any()
+    uv = turned.places(towards)
+    assert np.isnan(uv).all() and not turned.shows(towards, uv).any()
 
 
 def test_sights_of_a_frame_and_its_neighbours_are_kept_and_no_more(folded):

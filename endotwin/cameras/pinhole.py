@@ -84,7 +84,9 @@ class Pinhole(Camera):
         if self.distortion.any():
             xy = np.where((xy**2).sum(axis=-1, keepdims=True) < self._max_radius**2, xy, np.nan)
             xy = self._distorted(xy.reshape(-1, 2)).reshape(xy.shape)
-        return xy * (self.fx, self.fy) + (self.cx, self.cy)
+        xy *= (self.fx, self.fy)
+        xy += (self.cx, self.cy)
+        return xy
 
     def scaled(self, scale: float) -> Pinhole:
         return replace(self, **scaled_lengths(self, scale))

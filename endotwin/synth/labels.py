@@ -15,7 +15,6 @@ from endotwin.render import Renderer, View
 from endotwin.render.renderer import laid_out
 from endotwin.run.streams import Stream
 from endotwin.surface import Surface
-from endotwin.surface.casting import surface_points
 from endotwin.synth.job import Job
 from endotwin.synth.photograph import photographed
 from endotwin.synth.sight import Sights
@@ -185,7 +184,7 @@ class _Geometry:
         self._job, self._sights, self._index = job, sights, index
         self._sight = sights[index]
         self._hits = self._sight.hits
-        self._others: dict[int, np.ndarray] = {}
+        self._ways: dict[int, np.ndarray] = {}
         self._places: dict[int, np.ndarray] = {}
         self._kinds, self._polyps, self._renderer, self._view = kinds, polyps, renderer, view
 
@@ -271,18 +270,11 @@ class _Geometry:
     def flow_forward_hidden(self) -> np.ndarray:
         return self._hidden(self._index + 1)
 
-    @cached_property
-    def _points(self) -> np.ndarray:
-        return surface_points(self._sight.surface, self._hits)
-
-    def _points_at(self, index: int) -> np.ndarray:
-        """Where the points of the hits are in another frame, world, float64 [N, 3]."""
-        surface = self._sights[index].surface
-        if surface is self._sight.surface:
-            return self._points
-        if index not in self._others:
-            self._others[index] = surface_points(surface, self._hits)
-        return self._others[index]
+    def _towards(self, index: int) -> np.ndarray:
+        """From the camera of a frame to where the points of the hits are in it, mm, float32 [N, 3]."""
+        if index not in self._ways:
+            self._ways[index] = self._sights[index].towards(self._hits)
+        return self._ways[index]
 
     @property
     def scene_flow(self) -> np.ndarray:
@@ -300,7 +292,9 @@ class _Geometry:
     def _scene_flow(self, index: int) -> np.ndarray:
         if not self._exists(index):
             return self._image(np.full((len(self._hits), 3), np.nan, np.float32), np.nan)
-        return self._image((self._points_at(index) - self._points).astype(np.float32), np.nan)
+        poses = self._job.trajectory.T_world_camera
+        ridden_mm = (poses[index] - poses[self._index])[:3, 3].astype(np.float32)
+        return self._image(self._towards(index) - self._towards(self._index) + ridden_mm, np.nan)
 
     def _exists(self, index: int) -> bool:
         return 0 <= index < len(self._job.trajectory.T_world_camera)
@@ -308,7 +302,7 @@ class _Geometry:
     def _uv_at(self, index: int) -> np.ndarray:
         """Where the points of the hits lie in another frame's image, px, float64 [N, 2]."""
         if index not in self._places:
-            self._places[index] = self._sights[index].places(self._points_at(index))
+            self._places[index] = self._sights[index].places(self._towards(index))
         return self._places[index]
 
     def _flow(self, index: int) -> np.ndarray:
@@ -321,5 +315,5 @@ class _Geometry:
     def _hidden(self, index: int) -> np.ndarray:
         if not self._exists(index):
             return self._image(np.full(len(self._hits), HIDDEN_NONE, np.uint8), HIDDEN_NONE)
-        seen = self._sights[index].shows(self._points_at(index), self._uv_at(index))
+        seen = self._sights[index].shows(self._towards(index), self._uv_at(index))
         return self._image(np.where(seen, np.uint8(HIDDEN_NO), np.uint8(HIDDEN_YES)), HIDDEN_NONE)

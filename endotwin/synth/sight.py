@@ -55,25 +55,31 @@ class Sight:
         """What the rays through the pixels' centres meet."""
         return self.caster.cast(self._camera, self.T_world_camera)
 
-    def places(self, points: np.ndarray) -> np.ndarray:
-        """Where world points [N, 3] lie in the picture, px, float64 [N, 2]; NaN where the lens does not see
-        in that direction."""
-        return self._camera.project(to_camera_frame(points, self.T_world_camera))
+    def towards(self, hits: Correspondences) -> np.ndarray:
+        """From the camera to where the points of ``hits``, of any frame, are in this one, along the world's
+        axes, mm, float32 [N, 3]: within 1e-7 of their length."""
+        centre = self.T_world_camera[:3, 3] - self.surface.origin_mm
+        return hits.interpolate(self.surface, (self.surface.vertices_mm - centre).astype(np.float32))
 
-    def shows(self, points: np.ndarray, uv: np.ndarray) -> np.ndarray:
-        """Bool [N]: world points [N, 3] on the surface, at ``uv`` [N, 2], that are in the picture and not
-        hidden."""
+    def places(self, towards: np.ndarray) -> np.ndarray:
+        """Where points [N, 3], as ``towards`` gives them, lie in the picture, px, float64 [N, 2]; NaN where
+        the lens does not see in that direction."""
+        return self._camera.project(towards @ self.T_world_camera[:3, :3].astype(np.float32))
+
+    def shows(self, towards: np.ndarray, uv: np.ndarray) -> np.ndarray:
+        """Bool [N]: points of the surface [N, 3], as ``towards`` gives them, at ``uv`` [N, 2], that are in
+        the picture and not hidden."""
         width, height = self._camera.width, self._camera.height
         u, v = uv.T
-        towards = points - self.T_world_camera[:3, 3]
         distance_mm = np.sqrt(dot(towards, towards))
         seen, known = self._at_a_glance(u, v, distance_mm)
         inside = (u > -0.5) & (u < width - 0.5) & (v > -0.5) & (v < height - 0.5)
         asked = np.flatnonzero(inside & ~known)
-        towards, distance_mm = towards[asked], distance_mm[asked]
-        rays = (towards / np.maximum(distance_mm, 1e-9)[:, None]).astype(np.float32)
-        origins = np.broadcast_to(self._centre, rays.shape)
-        seen[asked] = self.caster.unobstructed(origins, rays, distance_mm * (1 - HIDDEN) - HIDDEN_MM)
+        distance_mm = distance_mm[asked].astype(np.float64)
+        rays = (towards[asked] / np.maximum(distance_mm, 1e-9)[:, None]).astype(np.float32)
+        centre = (self.T_world_camera[:3, 3] - self.surface.origin_mm).astype(np.float32)
+        length_mm = distance_mm * (1 - HIDDEN) - HIDDEN_MM
+        seen[asked] = self.caster.unobstructed(np.broadcast_to(centre, rays.shape), rays, length_mm)
         return seen
 
     def hides_surface(self) -> np.ndarray:
@@ -81,11 +87,6 @@ class Sight:
         camera (C3VD's occlusion)."""
         view = self._camera, self.T_world_camera, self.hits
         return self.caster.hides(*view, BEHIND_MM, OCCLUSION_RANGE_MM)
-
-    @property
-    def _centre(self) -> np.ndarray:
-        """Of the camera, in the surface's frame, float32 [3]."""
-        return (self.T_world_camera[:3, 3] - self.surface.origin_mm).astype(np.float32)
 
     @cached_property
     def _distances(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -107,7 +108,8 @@ class Sight:
         height, width = at.shape
         seen, known = np.zeros(len(u), bool), np.zeros(len(u), bool)
         chosen = np.flatnonzero((u >= 0) & (u < width - 1) & (v >= 0) & (v < height - 1))
-        u, v, distance_mm = (each.take(chosen).astype(np.float32) for each in (u, v, distance_mm))
+        u, v = (each.take(chosen).astype(np.float32) for each in (u, v))
+        distance_mm = distance_mm.take(chosen)
         pixel = v.astype(np.int32) * width + u.astype(np.int32)
         near, far = nearest.reshape(-1).take(pixel), farthest.reshape(-1).take(pixel)
         spread = far - near
@@ -124,11 +126,6 @@ def _between(image: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
     places[0, : len(u)], places[1, : len(u)] = u, v
     columns, rows = places.reshape(2, -1, COLUMNS)
     return cv2.remap(image, columns, rows, cv2.INTER_LINEAR).reshape(-1)[: len(u)]
-
-
-def to_camera_frame(points: np.ndarray, T_world_camera: np.ndarray) -> np.ndarray:
-    """World points [N, 3] in the frame of the camera at ``T_world_camera`` [4, 4]."""
-    return (points - T_world_camera[:3, 3]) @ T_world_camera[:3, :3]
 
 
 class Sights:

@@ -9,7 +9,6 @@ import numpy as np
 
 from endotwin.surface.silhouettes import discontinuities
 from endotwin.synth.proof.written import Written
-from endotwin.synth.sight import to_camera_frame
 
 FLOAT_STEP = 4e-7
 """Relative step of depth that was kept as float32, with the float32 ray that it was taken along."""
@@ -91,7 +90,7 @@ def landing(one: Frame, other: Frame, motion_mm: np.ndarray | None) -> Landing:
 
     def seen(distance_mm: np.ndarray) -> np.ndarray:
         points = one.T_world_camera[:3, 3] + rays * distance_mm[:, None] + moved
-        return to_camera_frame(points, other.T_world_camera)
+        return (points - other.T_world_camera[:3, 3]) @ other.T_world_camera[:3, :3]
 
     with np.errstate(all="ignore"):
         points = seen(distance_mm)
