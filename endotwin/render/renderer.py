@@ -132,7 +132,7 @@ class Renderer:
         self.caster = caster or Caster(twin.surface, threads)
         self._illumination = Illumination(twin, self.caster)
         self._exposure = np.asarray(exposure, np.float32)
-        self._normal_and_material = _normal_and_material(twin)
+        self._material = _material(twin)
 
     def edited(self, twin: Twin, exposure: Sequence[float] | float = 1.0) -> Renderer:
         """The renderer of another edit of the same twin; what the edits have in common is not made again."""
@@ -140,7 +140,7 @@ class Renderer:
         other.twin, other._exposure = twin, np.asarray(exposure, np.float32)
         other._illumination = Illumination(twin, self.caster, before=self._illumination)
         if twin.materials is not self.twin.materials:
-            other._normal_and_material = _normal_and_material(twin)
+            other._material = _material(twin)
         vars(other).pop("_transmission", None)
         return other
 
@@ -154,9 +154,6 @@ class Renderer:
             materials = replace(materials, film=replace(materials.film, normal=normal))
         other.twin, other.caster = replace(self.twin, surface=surface, materials=materials), caster
         other._illumination = self._illumination.moved(other.twin, caster)
-        other._normal_and_material = np.concatenate(
-            [surface.normals, self._normal_and_material[:, 3:]], axis=1
-        )
         return other
 
     def brighter(self, gain: float) -> Renderer:
@@ -263,11 +260,12 @@ class Renderer:
     def _points(
         self, rays: Camera | Rays, hits: Correspondences, light: ViewLight, T_world_camera: np.ndarray
     ) -> _Points:
-        mixed = hits.interpolate(self.twin.surface, self._normal_and_material)
-        normals = to_camera(mixed[:, :3], T_world_camera)
+        surface = self.twin.surface
+        normals = to_camera(hits.interpolate(surface, surface.normals), T_world_camera)
+        material = torch.from_numpy(hits.interpolate(surface, self._material))
         facing = -dot(normals, rays.pixel_directions.reshape(-1, 3).take(hits.pixel, axis=0)) > FACING
         lit, visible = light.lit(hits, rays.pixel_directions, normals)
-        return _Points(hits, normals, torch.from_numpy(mixed[:, 3:]), facing, lit, visible)
+        return _Points(hits, normals, material, facing, lit, visible)
 
 
 @dataclass(frozen=True, eq=False)
@@ -317,11 +315,10 @@ class _Met:
         return total / np.maximum(count, 1)[:, None], count
 
 
-def _normal_and_material(twin: Twin) -> np.ndarray:
-    """Normal, base colour, roughness and metallic of each vertex, float32 [V, 8]."""
+def _material(twin: Twin) -> np.ndarray:
+    """Base colour, roughness and metallic of each vertex, float32 [V, 5]."""
     materials = twin.materials
-    columns = [materials.base_color, materials.roughness[:, None], materials.metallic[:, None]]
-    return np.concatenate([twin.surface.normals, *columns], axis=1)
+    return np.column_stack([materials.base_color, materials.roughness, materials.metallic])
 
 
 def _alone(pixels: np.ndarray) -> np.ndarray:

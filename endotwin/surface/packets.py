@@ -15,8 +15,9 @@ from endotwin.surface import embree
 SIDE, WIDTH = 4, 16
 """A packet holds a square of pixels."""
 
-BAND = 16
-"""Rows of pixels that are followed at once: their packets stay in the cache."""
+BAND = 640
+"""Packets, or one row of them if that is more, that are filled and followed at once: they stay in the
+cache."""
 
 ROWS = 21
 ORIGIN, NEAR, DIRECTION, FAR = slice(0, 3), 3, slice(4, 7), 8
@@ -104,13 +105,15 @@ class Packets:
         """Rows of the picture, packets float32 [P, ROWS, WIDTH] with their rays, and masks int32 [P,
         WIDTH]."""
         height, width = valid.shape
-        count = BAND // SIDE * -(-width // SIDE)
-        packets, mask = _aligned((count, ROWS, WIDTH), np.float32), _aligned((count, WIDTH), np.int32)
+        across = -(-width // SIDE)
+        down = max(BAND // across, 1)
+        packets = _aligned((down * across, ROWS, WIDTH), np.float32)
+        mask = _aligned((down * across, WIDTH), np.int32)
         packets[:] = 0
         packets[:, ORIGIN] = origin[:, None]
         packets.view(np.uint32)[:, MASK] = NONE
-        for start in range(0, height, BAND):
-            rows = slice(start, min(start + BAND, height))
+        for start in range(0, height, down * SIDE):
+            rows = slice(start, min(start + down * SIDE, height))
             chosen = _packed(valid[rows, :, None])[:, 0]
             here, among = packets[: len(chosen)], mask[: len(chosen)]
             among[:] = -chosen.astype(np.int32)

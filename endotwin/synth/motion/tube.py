@@ -107,13 +107,16 @@ class Places:
         low = table.take(self.below, axis=0)
         return low + share * (table.take(self.below + 1, axis=0) - low)
 
+    def columns(self, table: np.ndarray) -> np.ndarray:
+        """As ``of_table``, of a table [S, C], float32 [C, N]: products by columns take half the time."""
+        return np.ascontiguousarray(self.of_table(table.astype(np.float32)).T)
+
 
 def moved(points: np.ndarray, places: Places, shift: np.ndarray, M: np.ndarray) -> np.ndarray:
     """Where ``points`` float32 [N, 3] go, float32 [N, 3]."""
-    table = np.concatenate([shift, (M - np.eye(3)).reshape(len(M), 9)], axis=1).astype(np.float32)
-    at = places.of_table(table)
-    r = places.across
-    return points + at[:, :3] + sum(at[:, 3 + k :: 3] * r[:, k, None] for k in range(3))
+    table = np.concatenate([shift, (M - np.eye(3)).reshape(len(M), 9)], axis=1)
+    at = places.columns(table)
+    return points + np.stack(at[:3] + _times(at[3:], places.across.T), axis=1)
 
 
 def turned(
@@ -127,18 +130,18 @@ def turned(
     step_mm = line.s_mm[1] - line.s_mm[0]
     rates = [np.gradient(table, step_mm, axis=0) for table in (shift, M)]
     own = np.einsum("sij,sj->si", M - np.eye(3), line.tangents)
-    table = np.concatenate([rates[0] - own, rates[1].reshape(-1, 9), M.reshape(-1, 9)], axis=1)
-    at = places.of_table(table.astype(np.float32))
-    by_r, matrix = at[:, 3:12], at[:, 12:]
-    w = at[:, :3] + _times(by_r, places.across)
-    turned_normals, slope = _times(matrix, normals), _times(matrix, places.slope)
-    space = dot(matrix[:, ::3], matrix[:, ::3]) + dot(slope, w)
-    return unit(turned_normals - slope * (dot(w, turned_normals) / space)[:, None]), space
+    at = places.columns(np.concatenate([rates[0] - own, rates[1].reshape(-1, 9), M.reshape(-1, 9)], axis=1))
+    w = at[:3] + _times(at[3:12], places.across.T)
+    turned_normals, slope = _times(at[12:], normals.T), _times(at[12:], places.slope.T)
+    squared_f, inward = (at[12::3] ** 2).sum(axis=0), (w * turned_normals).sum(axis=0)
+    space = squared_f + (slope * w).sum(axis=0)
+    return unit(np.stack(turned_normals - slope * (inward / space), axis=1)), space
 
 
 def _times(matrices: np.ndarray, vectors: np.ndarray) -> np.ndarray:
-    """Products [N, 3] of matrices [N, 9], row by row, with vectors [N, 3]."""
-    return np.stack([dot(matrices[:, 3 * k : 3 * k + 3], vectors) for k in range(3)], axis=1)
+    """Products [3, N] of matrices [9, N], row by row, with vectors [3, N]."""
+    x, y, z = vectors
+    return np.stack([matrices[k] * x + matrices[k + 1] * y + matrices[k + 2] * z for k in (0, 3, 6)])
 
 
 def _turn(one: np.ndarray, other: np.ndarray) -> np.ndarray:
