@@ -356,7 +356,7 @@ def test_poses_that_a_polyp_comes_too_near_to_are_dropped(bare, tmp_path):
         ("Is:count=2,x=0,y=12,z=0", "count"),
         ("Is:x=1", "give x, y and z"),
         ("Is:x=15,y=0,z=40", "mm from the surface"),
-        pytest.param("Ip:size=20", "no place that was tried holds it", marks=pytest.mark.slow),
+        ("Ip:size=20", "no place that was tried holds it"),
         (f"Ip:size=20,{on_the_wall(0.8)}", "cannot grow"),
         ("Is:colour=3", "'colour=3' is not understood"),
     ],

@@ -125,10 +125,17 @@ class Site:
 
     def fault(self, shape: Shape, caster: Caster) -> str:
         """What hinders the shape from growing here, as the end of a sentence; empty where nothing does."""
-        if self.met < 1 or self._torn(shape, caster.surface):
+        if self.met < 1:
             return "the wall there is not whole, or too bent"
         if self.single < WHOLE:
             return "the wall there lies in layers"
+        if not self._has_room(shape, caster):
+            return "the lumen is too narrow there"
+        torn = self._torn(shape, caster.surface)  # which takes the longest
+        return "the wall there is not whole, or too bent" if torn else ""
+
+    def _has_room(self, shape: Shape, caster: Caster) -> bool:
+        """Whether nothing is in the way of a shape that grows here."""
         points = self.grown(shape, shape.rings(16, 12, shape.edge))
         top = points[points[:, 2].argmax()]
         risen = points[points[:, 2] > max(0.3 * shape.height_mm, self.band_mm)]
@@ -139,8 +146,7 @@ class Site:
         length_mm = np.sqrt(dot(way, way))
         far = length_mm > 1e-6
         starts = self.placed(starts)[far].astype(np.float32)
-        free = caster.unobstructed(starts, unit(way[far]).astype(np.float32), length_mm[far])
-        return "" if free.all() else "the lumen is too narrow there"
+        return caster.unobstructed(starts, unit(way[far]).astype(np.float32), length_mm[far]).all()
 
 
 def _powers(across: np.ndarray) -> np.ndarray:
