@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import pairwise
 from pathlib import Path
 
 import cv2
@@ -99,11 +100,11 @@ class View:
 def laid_out(values: np.ndarray, pixel: np.ndarray, shape: tuple[int, int], empty: float = 0.0) -> np.ndarray:
     """Values [N, ...] of row-major pixels [N] as an image [H, W, ...] with ``empty`` elsewhere."""
     image = np.full((shape[0] * shape[1], *values.shape[1:]), empty, values.dtype)
-    starts = np.flatnonzero(np.diff(pixel, prepend=-2) != 1)
-    if len(starts) * RUN_PX >= len(pixel):
+    gaps = np.flatnonzero(pixel[1:] != pixel[:-1] + 1) + 1
+    if (len(gaps) + 1) * RUN_PX > len(pixel):
         image[pixel] = values
     else:
-        for start, end in zip(starts, np.append(starts[1:], len(pixel)), strict=True):
+        for start, end in pairwise((0, *gaps.tolist(), len(pixel))):
             image[pixel[start] : pixel[start] + end - start] = values[start:end]
     return image.reshape(*shape, *values.shape[1:])
 
@@ -335,11 +336,15 @@ def _close_slits(radiance: np.ndarray, told: np.ndarray, edges: np.ndarray) -> N
     Through such a slit, behind the rim of a fold, no depth map saw; but no surface is black.
     """
     closed = cv2.morphologyEx(told.view(np.uint8), cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8)) > 0
-    slits = np.nonzero(closed & ~told & edges)
-    if len(slits[0]):
-        count = cv2.boxFilter(told.astype(np.float32), -1, (3, 3), normalize=False)
-        total = cv2.boxFilter(radiance * told[..., None], -1, (3, 3), normalize=False)
-        radiance[slits] = total[slits] / np.maximum(count[slits], 1)[:, None]
+    row, column = np.nonzero(closed & ~told & edges)
+    about = np.mgrid[-1:2, -1:2].reshape(2, -1, 1)
+    rows, columns = (
+        np.clip(place + off, 0, size - 1)
+        for place, off, size in zip((row, column), about, told.shape, strict=True)
+    )
+    weight = told[rows, columns].astype(np.float32)
+    total = (radiance[rows, columns] * weight[..., None]).sum(axis=0)
+    radiance[row, column] = total / np.maximum(weight.sum(axis=0), 1)[:, None]
 
 
 def shadow_edges(visible: np.ndarray) -> np.ndarray:
