@@ -168,9 +168,10 @@ class _Trial:
         return verdict.worth(LEAST_VIGNETTING) if name == "vignetting" else verdict.keep
 
     def _settled(self, model: Fitted) -> Fitted:
-        """With its guides where they predict best beside all its effects."""
+        """With its guides where they predict best beside all its effects, if that is elsewhere."""
         guides_mm = Search.of(self._probe, model.hypothesis, self._glints()).settled()
-        return self._probe.fit(replace(model.hypothesis, guides_mm=guides_mm))
+        moved = self._probe.fit(replace(model.hypothesis, guides_mm=guides_mm))
+        return moved if self._probe.compare(model, moved).gain_db > 0 else model
 
     def decided(self, kept: Fitted) -> Decided:
         """The effects of ``kept``, each with the evidence for it or against it."""
