@@ -38,11 +38,15 @@ from endotwin.twin import Light, Twin
 TOGETHER = ("offset", "interreflection", "gain")
 BESIDE = ("profile", "vignetting")
 
-LEAST_GAIN = 0.08
-"""Standard deviation of ln gain below which, beside bounced light, it is none: the bounce from a mesh of what
-was seen errs by some 4 % of a whole frame's brightness. An automatic gain changes it by tens."""
+LEAST_GAIN, PLAIN_DB = 0.08, 3.0
+"""Standard deviation of ln gain below which, beside bounced light, it is none, unless it leaves half of the
+loss: the bounce from a mesh of what was seen errs by some 4 % of a frame's brightness. An automatic gain
+changes it by tens."""
 
-LEAST_VIGNETTING = Verdict(0.02, 3.0)
+LEAST_BOUNCE = Verdict(0.1, 3.0)
+"""What bounced light has to gain: it has no coefficient of its own, and where there is none it loses."""
+
+LEAST_VIGNETTING = Verdict(0.05, 3.0)
 """What vignetting has to gain: exponent and profile of the light say nearly the same, so that it can gain
 little; wrongly on, it is fitted to none."""
 
@@ -90,7 +94,7 @@ class _Trial:
         self._decisions: dict[str, Decision] = {}
         self._seconds = dict.fromkeys((*TOGETHER, *BESIDE), 0.0)
         self._model, self._bouncing = cache(self._fitted), cache(self._bounced)
-        self._guides_mm = AT_LENS
+        self._guides_mm = {False: AT_LENS, True: AT_LENS}
 
     def wanted(self, name: str) -> str:
         return self._wanted.get(name, "auto")
@@ -101,15 +105,33 @@ class _Trial:
         best = self._best(lens)
         if self.wanted("offset") != "off" and len(self._probe):
             began = time.perf_counter()
-            base = replace(self._model(best).hypothesis, vignetting=self.wanted("vignetting") != "off")
-            forced = self.wanted("offset") == "on"
-            self._guides_mm = found_guides(self._probe, base, self._glints(), forced)
+            self._seek_guides(best)
             self._seconds["offset"] += time.perf_counter() - began
-        sets = self._sets(TOGETHER) if self._guides_mm != AT_LENS else lens
+        sets = self._sets(TOGETHER) if self._beside_lens else lens
         kept, verdicts = self._pruned(self._best(sets))
         for name in TOGETHER:
             self._say(name, name in kept, verdicts.get(name) or self._beside_kept(name, kept))
         return self._model(kept)
+
+    def _seek_guides(self, best: frozenset[str]) -> None:
+        """Find the guides without and with bounced light, if there are any beside the best set without them.
+
+        Where bounced light is left out, a guide near the lens throws into the shadows what nothing else does.
+        """
+        base = replace(self._model(best).hypothesis, vignetting=self.wanted("vignetting") != "off")
+        found_mm = found_guides(self._probe, base, self._glints(), self.wanted("offset") == "on")
+        bounces = base.bounced is not None
+        self._guides_mm = dict.fromkeys((False, True), found_mm)
+        if found_mm == AT_LENS or self.wanted("interreflection") != "auto":
+            return
+        other = replace(base, bounced=None if bounces else self._bouncing(found_mm))
+        other_mm = found_guides(self._probe, other, self._glints(), False)
+        if other_mm != AT_LENS:
+            self._guides_mm[not bounces] = other_mm
+
+    @property
+    def _beside_lens(self) -> bool:
+        return self._guides_mm[False] != AT_LENS
 
     def shadowed(self, kept: Fitted) -> Fitted:
         """``kept``, whose guides cast shadows, or the same without them if no held-out pixel shows any."""
@@ -118,7 +140,7 @@ class _Trial:
             self._decisions["shadows"] = Decision("off", reason)
             return kept
         unshadowed = self._probe.fit(replace(kept.hypothesis, shadows=False))
-        verdict = self._probe.compare(unshadowed, kept)
+        verdict = self._probe.told_by_shadows(kept, unshadowed)
         on = self.wanted("shadows") == "on" or (self.wanted("shadows") == "auto" and verdict.keep)
         self._say("shadows", on, verdict)
         return kept if on else unshadowed
@@ -133,14 +155,23 @@ class _Trial:
         other = self._mixed(kept) if name == "profile" else replace(kept.hypothesis, vignetting=True)
         other = self._probe.fit(other)
         verdict = self._probe.compare(kept, other)
-        worth = verdict.worth(LEAST_VIGNETTING) if name == "vignetting" else verdict.keep
-        on = self.wanted(name) == "on" or worth
+        on = self.wanted(name) == "on" or self._worth_beside(name, verdict)
         if on and other.hypothesis.guides_mm != AT_LENS:
-            polished_mm = Search.of(self._probe, other.hypothesis, self._glints()).polished()
-            other = self._probe.fit(replace(other.hypothesis, guides_mm=polished_mm))
+            kept, other = self._settled(kept), self._settled(other)
+            verdict = self._probe.compare(kept, other)
+            on = self.wanted(name) == "on" or self._worth_beside(name, verdict)
         self._say(name, on, verdict)
         self._seconds[name] += time.perf_counter() - began
         return other if on else kept
+
+    def _worth_beside(self, name: str, verdict: Verdict) -> bool:
+        return verdict.worth(LEAST_VIGNETTING) if name == "vignetting" else verdict.keep
+
+    def _settled(self, model: Fitted) -> Fitted:
+        """With its guides where they predict best beside all its effects, if that is elsewhere."""
+        guides_mm = Search.of(self._probe, model.hypothesis, self._glints()).settled()
+        moved = self._probe.fit(replace(model.hypothesis, guides_mm=guides_mm))
+        return moved if self._probe.compare(model, moved).gain_db > 0 else model
 
     def decided(self, kept: Fitted) -> Decided:
         """The effects of ``kept``, each with the evidence for it or against it."""
@@ -169,7 +200,8 @@ class _Trial:
         began = time.perf_counter()
         hypothesis = Hypothesis(gain="gain" in names)
         if "offset" in names:
-            hypothesis = replace(hypothesis, guides_mm=self._guides_mm, shadows=True)
+            guides_mm = self._guides_mm["interreflection" in names]
+            hypothesis = replace(hypothesis, guides_mm=guides_mm, shadows=True)
         if "interreflection" in names:
             hypothesis = replace(hypothesis, bounced=self._bouncing(hypothesis.guides_mm))
         found = self._probe.fit(hypothesis)
@@ -204,8 +236,9 @@ class _Trial:
 
     def _worth(self, name: str, names: frozenset[str], verdict: Verdict) -> bool:
         if name == "gain" and "interreflection" in names:
-            return verdict.keep and float(self._model(names).log_gain.std()) >= LEAST_GAIN
-        return verdict.keep
+            changes = float(self._model(names).log_gain.std()) >= LEAST_GAIN
+            return verdict.keep and (changes or verdict.gain_db >= PLAIN_DB)
+        return verdict.worth(LEAST_BOUNCE) if name == "interreflection" else verdict.keep
 
     def _verdict(self, without: frozenset[str], names: frozenset[str]) -> Verdict:
         return self._probe.compare(self._model(without), self._model(names))
@@ -213,7 +246,7 @@ class _Trial:
     def _beside_kept(self, name: str, kept: frozenset[str]) -> Verdict | None:
         """What an effect that is off would gain; None where that was not tried."""
         tried = self.wanted(name) != "off" and self._tellable(name, None)
-        if not tried or (name == "offset" and self._guides_mm == AT_LENS):
+        if not tried or (name == "offset" and not self._beside_lens):
             return None
         return self._verdict(kept, kept | {name})
 
@@ -267,5 +300,5 @@ class _Trial:
             log_gain = kept.log_gain - kept.log_gain.mean()
             effects.append(Gain(tuple(map(int, probe.frames)), tuple(map(float, log_gain))))
         if hypothesis.vignetting:
-            effects.append(Vignetting(k2=float(kept.effects.coefficients[3] / kept.start[2])))
+            effects.append(Vignetting(k2=kept.vignetting))
         return Effects(effects)

@@ -112,6 +112,10 @@ class Search:
         """``known_mm`` [K, 3] with each of the candidates, [K + 1, 3] each."""
         return [np.vstack([known_mm, candidate]) for candidate in self._candidates]
 
+    def settled(self) -> Guides:
+        """The base's own guides, moved to where they predict best beside all that was kept since."""
+        return self._refined(self._base.hypothesis.guides_mm, axes=3)
+
     def polished(self) -> Guides:
         """The base's own guides, moved to where they predict best beside all that was kept since: in the
         plane of the lens, then behind it, too."""

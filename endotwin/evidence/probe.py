@@ -1,9 +1,13 @@
 """The probe: which model of light leaves less of the photos unexplained, on pixels that it was not fitted to.
 
-Where tissue is diffuse, ln C = γ·(ln b + ln Σ light) with one unknown albedo b a vertex. Taking out each
-vertex's mean leaves a linear regression in γn, γq and γ, whatever the light is made of; it takes
-milliseconds. Half of the vertices choose the coefficients, the other half judges them, then the halves
-change places.
+ln C = γ·(ln b + ln Σ light·answer) with one unknown albedo b a vertex, and an answer of the tissue that is
+nearly 1 where it is diffuse. Taking out each vertex's mean leaves a linear regression in γn, γq and γ,
+whatever the light is made of; it takes milliseconds. Half of the vertices choose the coefficients, the other
+half judges them, then the halves change places.
+
+How tissue answers light beside its colour is part of every model: a rough lobe reaches far beyond the
+highlights that are left out, and retro-reflection far from the rim. What a model lacks there, guides,
+vignetting and a gain would explain, none of which is there.
 """
 
 from __future__ import annotations
@@ -16,11 +20,19 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
-from endotwin.effects.vignetting import squared_radius
-from endotwin.light.guides import AT_LENS, COSINE, guided, log_axis, visible_from
-from endotwin.pixels.fixed_effects import Design, FixedEffects, regress, robust_losses, robust_residuals
-from endotwin.pixels.start import LIGHT_MEAN, LIGHT_SPREAD, PRIOR, diffuse
-from endotwin.surface.vectors import unit
+from endotwin.evidence.sightings import Sightings
+from endotwin.light import shading
+from endotwin.light.forward import Lit
+from endotwin.light.guides import AT_LENS, COSINE, guided, log_axis
+from endotwin.pixels.fixed_effects import (
+    Design,
+    FixedEffects,
+    pseudo_huber,
+    regress,
+    robust_losses,
+    robust_residuals,
+)
+from endotwin.pixels.start import ALBEDO_MIDDLE, LIGHT_MEAN, LIGHT_SPREAD, PRIOR, dark, diffuse
 
 if TYPE_CHECKING:
     from endotwin.pixels.samples import Samples
@@ -46,8 +58,32 @@ VIGNETTING_SPREAD = 0.1
 """Prior standard deviation of γ·k2 about 0. Like that of γn, γq and γ it counts against one
 observation a vertex: what the model lacks errs alike in all pixels of one."""
 
+TISSUE_MEAN = (1.0, math.log(shading.F0_DIELECTRIC / ALBEDO_MIDDLE), shading.ROUGHNESS_TISSUE)
+TISSUE_SPREAD = (0.7, 0.7, 0.1)
+"""Prior of the tissue's answer to light, see ``Tissue``: from Lambert's lobe to one rougher than usual; f0
+and albedo of half or twice what they mostly are."""
+
+TISSUE_BOUNDS = ((0.0, math.log(0.02 / 0.9), 0.15), (2.0, math.log(0.05 / 0.25), 0.7))
+"""Retro-reflection from Lambert's lobe to that of Burley's roughest tissue; f0 from water's to more than
+a dielectric's, on pale tissue and on dark; no mirror and no chalk."""
+
+ALBEDO_RANGE = 5.0
+"""Albedos are told to within this factor of the median: enough for how much their lobes stand out."""
+
+HELD = 1e-6
+"""Spread of what is not to move."""
+
+ROUNDS = 3
+"""In which a model is linearised about what it was found to be."""
+
+ASIDE = 0.02
+"""Roughness by which its derivative is taken."""
+
 POSSIBLE = ((0.1, 2.0), (-1.0, 12.0), (-0.5, 7.0))
 """Bounds of γ, n and q, with room for their errors: beyond, few pixels were explained by many things."""
+
+LEAST_GAMMA = 0.05
+"""Less is found where photos tell nothing: a model is not linearised about that."""
 
 HINT_DB, HINT_SIGMAS = 0.1, 2.0
 """What is worth a longer look, which then has to be worth keeping."""
@@ -74,6 +110,44 @@ class Bounced:
     def at(self, n: float, q: float) -> np.ndarray:
         """ln of the irradiance [N] under another n and q, to first order about their priors."""
         return self.log + (n - PRIOR["n"]) * self.by_n + (q - PRIOR["q"]) * self.by_q
+
+
+@dataclass(frozen=True)
+class Tissue:
+    """How all tissue answers light, beside its colour.
+
+    Attributes:
+        retro: power of Burley's diffuse lobe at the usual roughness; with 0 it is Lambert's.
+        log_gloss: ln of f0 over the median albedo. roughness: of the specular lobe.
+    """
+
+    retro: float = TISSUE_MEAN[0]
+    log_gloss: float = TISSUE_MEAN[1]
+    roughness: float = TISSUE_MEAN[2]
+
+    def moved(self, change: np.ndarray) -> Tissue:
+        """Changed by so much [3], within TISSUE_BOUNDS."""
+        return Tissue(*map(float, np.clip(np.add(self.values, change), *TISSUE_BOUNDS)))
+
+    @property
+    def at_bounds(self) -> np.ndarray:
+        """Bool [3]: what would be less or more than any tissue's."""
+        return np.isin(self.values, TISSUE_BOUNDS)
+
+    @property
+    def values(self) -> tuple[float, float, float]:
+        return self.retro, self.log_gloss, self.roughness
+
+
+@dataclass(frozen=True)
+class About:
+    """Where a model is linearised: exponents of the light, answer of the tissue, and albedo of the vertices
+    [count] over that of the median pixel; None: all alike."""
+
+    n: float = PRIOR["n"]
+    q: float = PRIOR["q"]
+    tissue: Tissue = Tissue()
+    albedo: np.ndarray | None = None
 
 
 @dataclass(frozen=True)
@@ -117,11 +191,12 @@ class Verdict:
 
 @dataclass(frozen=True)
 class Fitted:
-    """A hypothesis with its coefficients, and the design that they belong to."""
+    """A hypothesis with its coefficients, the design that they belong to, and where that is linearised."""
 
     hypothesis: Hypothesis
     design: Design
     effects: FixedEffects
+    about: About
 
     @property
     def gamma(self) -> float:
@@ -141,6 +216,15 @@ class Fitted:
         return float(self.effects.coefficients[1] / self.effects.coefficients[2])
 
     @property
+    def tissue(self) -> Tissue:
+        return self.about.tissue.moved(self.effects.coefficients[3:6] / self.gamma)
+
+    @property
+    def vignetting(self) -> float:
+        """k2; of a hypothesis that has vignetting."""
+        return float(self.effects.coefficients[6] / self.start[2])
+
+    @property
     def possible(self) -> bool:
         """Whether γ, n and q are such as an endoscope may have."""
         (least, most), *bounds = POSSIBLE
@@ -154,99 +238,48 @@ class Fitted:
         return (self.n, self.q, self.gamma) if self.possible else (PRIOR["n"], PRIOR["q"], PRIOR["gamma"])
 
 
-class Probe:
-    """Pixels of some vertices, all that each of them shows, and hypotheses about their light.
+class Probe(Sightings):
+    """Sightings of some vertices, all that tell their light, and hypotheses about it.
 
     Attributes:
-        samples: the pixels. vertex: int [N], numbered without gaps.
+        count: number of the vertices. dark: other sightings of them, that show no light.
     """
 
     def __init__(self, samples: Samples, twin: Twin, caster: Caster, pixels: int = PIXELS, seed: int = 0):
         surface = twin.surface
-        self.twin, self.caster = twin, caster
         generator = np.random.default_rng(seed)
-        rows = np.flatnonzero(diffuse(samples))
-        vertex = samples.nearest(surface.triangles)[rows]
-        chosen = _whole_groups(vertex, len(surface.vertices_mm), pixels, generator)
+        rows, every = np.flatnonzero(diffuse(samples)), samples.nearest(surface.triangles)
+        chosen = _whole_groups(every[rows], len(surface.vertices_mm), pixels, generator)
         self._rows = rows[chosen]
-        self.samples = samples[torch.from_numpy(self._rows)]
-        self.vertex = np.unique(vertex[chosen], return_inverse=True)[1].reshape(-1)
-        self.count = int(self.vertex.max(initial=-1)) + 1
+        known, vertex = np.unique(every[self._rows], return_inverse=True)
+        super().__init__(samples[torch.from_numpy(self._rows)], vertex.reshape(-1), twin, caster)
+        self.count = len(known)
         self._half = (generator.random(self.count) < 0.5)[self.vertex]
-        self.target = np.log(self.samples.color.numpy().mean(axis=1, dtype=np.float64) / 255)
-
-    def __len__(self) -> int:
-        return len(self.target)
+        self.target = np.log(self.shown)
+        rows = np.flatnonzero(dark(samples) & np.isin(every, known))
+        rows = rows[np.isin(samples.frame.numpy()[rows], self.frames)]
+        numbers = np.searchsorted(known, every[rows])
+        self.dark = Sightings(samples[torch.from_numpy(rows)], numbers, twin, caster)
 
     def part(self, pixels: int) -> tuple[Probe, np.ndarray]:
         """A probe of about so many of these pixels, all of some vertices; and which, int [M]."""
         part = Probe(self.samples, self.twin, self.caster, pixels)
         return part, part._rows
 
-    @cached_property
-    def frames(self) -> np.ndarray:
-        """The frames that the pixels come from, ascending."""
-        return np.unique(self.samples.frame.numpy())
-
-    @cached_property
-    def frame(self) -> np.ndarray:
-        """Position of each pixel's frame in ``frames``, int [N]."""
-        return np.searchsorted(self.frames, self.samples.frame.numpy())
-
-    @cached_property
-    def T_local_camera(self) -> np.ndarray:
-        """Poses of ``frames`` in the surface's frame, float64 [F, 4, 4]."""
-        views = self.samples.views
-        return views.T_local_camera[np.searchsorted(views.frames, self.frames)]
-
-    @cached_property
-    def points_mm(self) -> np.ndarray:
-        """Surface points in the camera frame, float32 [N, 3]."""
-        local = self.local_points_mm - self.T_local_camera[self.frame, :3, 3]
-        return np.einsum("nba,nb->na", self.T_local_camera[self.frame, :3, :3], local).astype(np.float32)
-
-    @cached_property
-    def normals(self) -> np.ndarray:
-        """Unit normals in the camera frame, float32 [N, 3]."""
-        turned = np.einsum("nba,nb->na", self.T_local_camera[self.frame, :3, :3], self.local_normals)
-        return unit(turned.astype(np.float32))
-
-    @cached_property
-    def local_points_mm(self) -> np.ndarray:
-        """Surface points in the surface's frame, float32 [N, 3]."""
-        return self._interpolated(self.twin.surface.vertices_mm)
-
-    @cached_property
-    def local_normals(self) -> np.ndarray:
-        """Normals in the surface's frame, float32 [N, 3]."""
-        return self._interpolated(self.twin.surface.normals)
-
-    def visible(self, guide_mm: np.ndarray, rows: np.ndarray | None = None) -> np.ndarray:
-        """Bool [N]: whether a guide [3] (camera frame) sees each pixel's point (or of those in ``rows``)."""
-        rows = np.arange(len(self)) if rows is None else rows
-        seen = np.empty(len(rows), bool)
-        order = np.argsort(self.frame[rows], kind="stable")
-        bounds = np.searchsorted(self.frame[rows][order], np.arange(len(self.frames) + 1))
-        for number, pose in enumerate(self.T_local_camera):
-            part = order[bounds[number] : bounds[number + 1]]
-            points_mm = self.points_mm[rows[part]]
-            seen[part] = visible_from(self.caster, pose, points_mm, guide_mm[None])[:, 0] > 0
-        return seen
-
     def direct_light(self, hypothesis: Hypothesis, n: float, q: float) -> np.ndarray:
         """Irradiance [N] of the pixels' points under the hypothesis's guides with L0 = 1."""
-        light = self._light(hypothesis)
-        return np.exp(light.log_cos + n * light.log_axis - q * light.log_distance).sum(axis=1)
+        return log_light(self, hypothesis).irradiance(n, q)
 
-    def fit(self, hypothesis: Hypothesis, n: float = PRIOR["n"], q: float = PRIOR["q"]) -> Fitted:
-        """The hypothesis with coefficients from all pixels; linearised about ``n`` and ``q``, twice if need
-        be."""
-        linear = hypothesis.guides_mm == AT_LENS and hypothesis.bounced is None
-        light = self._light(hypothesis)
-        for _ in range(1 if linear else 2):
-            found = self._fitted(hypothesis, self._design(hypothesis, light.columns(n, q)))
-            if found.gamma > 0.05:
-                n, q = found.n, found.q
+    def fit(self, hypothesis: Hypothesis) -> Fitted:
+        """The hypothesis with coefficients from all pixels; linearised about what it was found to be."""
+        light, about = log_light(self, hypothesis), About()
+        for number in range(ROUNDS):
+            held = about.tissue.at_bounds & (number == ROUNDS - 1)
+            design = self._design(hypothesis, light, about, held)
+            found = Fitted(hypothesis, design, regress(self.target, design, len(self.frames)), about)
+            if found.gamma <= LEAST_GAMMA or number == ROUNDS - 1 or not len(self):
+                break
+            about = About(found.n, found.q, found.tissue, self._albedo(found))
         return found
 
     def residuals(
@@ -254,7 +287,9 @@ class Probe:
     ) -> np.ndarray:
         """Robust residuals [N], in widths of those of ``base``, linearised about it, under guides that see
         the pixels as ``visible`` [N, K] says (found out unless given)."""
-        design = self._design(hypothesis, self._light(hypothesis, visible).columns(base.n, base.q))
+        about = base.about if base.possible else About()
+        light, held = log_light(self, hypothesis, visible), about.tissue.at_bounds
+        design = self._design(hypothesis, light, about, held)
         found = regress(self.target, design, len(self.frames), rounds=2)
         return robust_residuals(self.target, design, found, base.effects.width)
 
@@ -264,42 +299,87 @@ class Probe:
         verdict = compared(self.target, *designs, self._half, base.effects.width, len(self.frames))
         return replace(verdict, possible=other.possible or not base.possible)
 
-    def _fitted(self, hypothesis: Hypothesis, design: Design) -> Fitted:
-        return Fitted(hypothesis, design, regress(self.target, design, len(self.frames)))
+    def told_by_shadows(self, cast: Fitted, uncast: Fitted) -> Verdict:
+        """How much better ``cast`` shows the photos than ``uncast``, the same without shadows.
 
-    def _design(self, hypothesis: Hypothesis, columns: np.ndarray) -> Design:
-        mean, spread = list(LIGHT_MEAN), list(LIGHT_SPREAD)
+        A pixel that shows light lies in no full shadow, so that those which do tell nothing of it: the dark
+        ones count here, too, and all as they look.
+        """
+        if cast.hypothesis.bounced is not None:
+            return self.compare(uncast, cast)
+        scale = uncast.effects.width * float(np.median(self.shown))
+        gained, after = np.zeros(self.count), 0.0
+        for part in (self, self.dark):
+            left = [(part.shown - self._predicted(found, part)) / scale for found in (uncast, cast)]
+            losses = [pseudo_huber(each) for each in left]
+            gained += np.bincount(part.vertex, losses[0] - losses[1], self.count)
+            after += float(losses[1].sum())
+        return verdict_of(gained, after)
+
+    def _predicted(self, found: Fitted, sightings: Sightings) -> np.ndarray:
+        """What the photos show at ``sightings``, [M] in 0 … 1; nothing where no guide is seen."""
+        hypothesis = found.hypothesis
+        columns = _columns(sightings, hypothesis, log_light(sightings, hypothesis), found.about)
+        frame = np.searchsorted(self.frames, sightings.samples.frame.numpy())
+        design = Design(columns, sightings.vertex, self.count, frame if hypothesis.gain else None)
+        shown = np.exp(design.explained(found.effects) + self._intercepts(found)[sightings.vertex])
+        return shown * sightings.lit(hypothesis.guides_mm) if hypothesis.shadows else shown
+
+    def _intercepts(self, found: Fitted) -> np.ndarray:
+        """What is left of ln C at each vertex, [count]."""
+        left = self.target - found.design.explained(found.effects)
+        return np.bincount(self.vertex, left, self.count) / np.bincount(self.vertex, minlength=self.count)
+
+    def _albedo(self, found: Fitted) -> np.ndarray:
+        """Albedo [count] of the vertices over that of the median pixel."""
+        log_albedo = self._intercepts(found) / found.gamma
+        most = math.log(ALBEDO_RANGE)
+        return np.exp(np.clip(log_albedo - np.median(log_albedo[self.vertex]), -most, most))
+
+    def _design(self, hypothesis: Hypothesis, light: LogLight, about: About, held: np.ndarray) -> Design:
+        """Linearised; what is ``held`` [3] of the tissue does not move."""
+        moved = np.where(held, 0, PRIOR["gamma"] * np.subtract(TISSUE_MEAN, about.tissue.values))
+        spread = np.where(held, HELD, np.multiply(PRIOR["gamma"], TISSUE_SPREAD))
+        mean, spread = [*LIGHT_MEAN, *moved], [*LIGHT_SPREAD, *spread]
         if hypothesis.vignetting:
-            columns = np.c_[columns, self.vignetting_column]
             mean, spread = [*mean, 0.0], [*spread, VIGNETTING_SPREAD]
         precision = len(self) / max(self.count, 1) / np.square(spread)
-        prior = np.diag(precision), precision * mean
-        return Design(columns, self.vertex, self.count, self.frame if hypothesis.gain else None, prior=prior)
+        return Design(
+            _columns(self, hypothesis, light, about),
+            self.vertex,
+            self.count,
+            self.frame if hypothesis.gain else None,
+            prior=(np.diag(precision), precision * mean),
+        )
 
-    def _interpolated(self, per_vertex: np.ndarray) -> np.ndarray:
-        corners = per_vertex[self.twin.surface.triangles[self.samples.triangle.numpy()]]
-        return np.einsum("nk,nka->na", self.samples.barycentric.numpy(), corners)
 
-    def _light(self, hypothesis: Hypothesis, visible: np.ndarray | None = None) -> LogLight:
-        if hypothesis.guides_mm == AT_LENS:
-            cos, log_distance = self.samples.cos.numpy()[:, None], self.samples.log_distance.numpy()[:, None]
-            axis = self.samples.log_cos_axis.numpy()[:, None]
-            if hypothesis.profile != COSINE:
-                axis = log_axis(np.exp(axis), hypothesis.profile)
-        else:
-            guides_mm = np.asarray(hypothesis.guides_mm, np.float32)
-            if hypothesis.shadows and visible is None:
-                visible = np.stack([self.visible(guide) for guide in guides_mm], axis=1)
-            lit = guided(self.points_mm, self.normals, guides_mm, hypothesis.profile, visible)
-            cos, axis, log_distance = (value.numpy() for value in (lit.cos_i, lit.log_axis, lit.log_distance))
-        log_cos = np.log(np.maximum(cos / cos.shape[1], math.exp(DARKEST)))
-        return LogLight(log_cos, axis, log_distance, hypothesis.bounced)
+def _columns(sightings: Sightings, hypothesis: Hypothesis, light: LogLight, about: About) -> np.ndarray:
+    """Those of the light, and of vignetting where there is any."""
+    columns = light.columns(about, sightings.vertex)
+    return np.c_[columns, sightings.vignetting_column] if hypothesis.vignetting else columns
 
-    @cached_property
-    def vignetting_column(self) -> np.ndarray:
-        """r² of each pixel, r = 1 at the middle of the image's longer side, [N]. No r⁴ beside it: light of
-        another exponent n is darker towards the rim in nearly the same way, and would lose its n to both."""
-        return squared_radius(self.twin.camera, self.samples.pixel.numpy())
+
+def log_light(sightings: Sightings, hypothesis: Hypothesis, visible: np.ndarray | None = None) -> LogLight:
+    """The light of a hypothesis at sightings that its guides see as ``visible`` [N, K] says (found out unless
+    given).
+
+    What shows light is lit, whatever the surface says: no pixel is taken to lie in all guides' shadow where
+    nothing else would light it.
+    """
+    samples = sightings.samples
+    if hypothesis.guides_mm == AT_LENS:
+        axis = samples.log_cos_axis
+        if hypothesis.profile != COSINE:
+            axis = torch.from_numpy(log_axis(axis.exp().numpy(), hypothesis.profile))
+        lit = Lit.at_lens(samples.cos, samples.sin2, axis, samples.log_distance)
+        return LogLight(lit, hypothesis.bounced)
+    guides_mm = np.asarray(hypothesis.guides_mm, np.float32)
+    if hypothesis.shadows and visible is None:
+        visible = sightings.visible_to(guides_mm)
+    if hypothesis.shadows and hypothesis.bounced is None:
+        visible = visible | ~visible.any(axis=1, keepdims=True)
+    lit = guided(sightings.points_mm, sightings.normals, guides_mm, hypothesis.profile, visible)
+    return LogLight(Lit(samples.cos, lit), hypothesis.bounced)
 
 
 def compared(
@@ -312,9 +392,13 @@ def compared(
         categories: number of the designs' categories.
     """
     before, after = (_held_out(target, design, half, width, categories) for design in (base, other))
-    gained = np.bincount(base.group, before - after, base.count)
+    return verdict_of(np.bincount(base.group, before - after, base.count), float(after.sum()))
+
+
+def verdict_of(gained: np.ndarray, after: float) -> Verdict:
+    """The verdict on losses that groups [G] lost by ``gained``, to ``after`` in all."""
     sigma = max(math.sqrt(float((gained**2).sum())), 1e-30)
-    ratio = before.sum() / max(float(after.sum()), 1e-30)
+    ratio = (float(gained.sum()) + after) / max(after, 1e-30)
     return Verdict(10 * math.log10(max(ratio, 1e-30)), float(gained.sum()) / sigma)
 
 
@@ -330,32 +414,70 @@ def _held_out(
 
 @dataclass(frozen=True)
 class LogLight:
-    """ln Σ light at N pixels, as a function of n and q.
+    """ln Σ light·answer at N pixels, as a function of n, q and the tissue's answer.
 
     Attributes:
-        log_cos, log_axis, log_distance: float [N, K], of each guide. bounced: what comes from other tissue.
+        lit: by K guides. bounced: what comes from other tissue.
     """
 
-    log_cos: np.ndarray
-    log_axis: np.ndarray
-    log_distance: np.ndarray
+    lit: Lit
     bounced: Bounced | None
 
-    def columns(self, n: float, q: float) -> np.ndarray:
-        """Columns [N, 3] whose coefficients are γn, γq and γ, linearised about n and q (exact for one
-        lamp)."""
-        terms = self.log_cos + n * self.log_axis - q * self.log_distance
-        by_n, by_q = self.log_axis, -self.log_distance
+    @cached_property
+    def log_cos(self) -> np.ndarray:
+        """ln of each guide's share n·ωi / K, [N, K]."""
+        cos_i = self.lit.guides.cos_i.numpy()
+        return np.log(np.maximum(cos_i / cos_i.shape[1], math.exp(DARKEST)))
+
+    @cached_property
+    def log_burley(self) -> np.ndarray:
+        """ln of the diffuse lobe where tissue is as rough as usual, over Lambert's, [N, K]."""
+        guides, roughness = self.lit.guides, torch.tensor(shading.ROUGHNESS_TISSUE)
+        lobe = shading.burley(guides.cos_i, self.lit.cos_o[:, None], guides.cos_d, roughness)
+        return lobe.log().numpy()
+
+    def irradiance(self, n: float, q: float) -> np.ndarray:
+        """[N], of all guides together with L0 = 1."""
+        guides = self.lit.guides
+        return np.exp(self.log_cos + n * guides.log_axis.numpy() - q * guides.log_distance.numpy()).sum(
+            axis=1
+        )
+
+    def columns(self, about: About, vertex: np.ndarray) -> np.ndarray:
+        """Columns [N, 6] at places of vertices [N], linearised; their coefficients are γn, γq, γ, and γ times
+        what retro, log_gloss and roughness of the tissue are more than ``about`` has them."""
+        n, q, tissue = about.n, about.q, about.tissue
+        axis, distance = self.lit.guides.log_axis.numpy(), self.lit.guides.log_distance.numpy()
+        lobe, by_roughness = self._lobe(tissue.roughness)
+        albedo = 1.0 if about.albedo is None else about.albedo[vertex, None]
+        shine = math.pi * math.exp(tissue.log_gloss) / albedo * lobe
+        answer = np.exp(tissue.retro * self.log_burley) + shine
+        shine = shine / answer
+        terms = self.log_cos + n * axis - q * distance + np.log(answer)
+        slopes = [axis, -distance, (1 - shine) * self.log_burley, shine, shine * by_roughness]
         if self.bounced is not None:
             terms = np.c_[terms, self.bounced.at(n, q)]
-            by_n, by_q = np.c_[by_n, self.bounced.by_n], np.c_[by_q, self.bounced.by_q]
+            still = np.zeros(len(terms))
+            bounced = self.bounced.by_n, self.bounced.by_q, still, still, still
+            slopes = [np.c_[pair] for pair in zip(slopes, bounced, strict=True)]
         top = terms.max(axis=1, keepdims=True)
         share = np.exp(terms - top)
         total = share.sum(axis=1, keepdims=True)
         share /= total
-        by_n, by_q = (share * by_n).sum(axis=1), (share * by_q).sum(axis=1)
+        by_n, by_q, *by_tissue = ((share * slope).sum(axis=1) for slope in slopes)
         level = (top + np.log(total))[:, 0]
-        return np.stack([by_n, by_q, level - n * by_n - q * by_q], axis=1)
+        return np.stack([by_n, by_q, level - n * by_n - q * by_q, *by_tissue], axis=1)
+
+    def _lobe(self, roughness: float) -> tuple[np.ndarray, np.ndarray]:
+        """The specular lobe [N, K] per unit of f0, and the derivative of its logarithm by roughness."""
+        guides = self.lit.guides
+
+        def at(roughness: float) -> np.ndarray:
+            rough = torch.tensor(roughness)
+            return shading.specular_lobe(guides.cos_i, self.lit.cos_o[:, None], guides.sin2_m, rough).numpy()
+
+        less, more = (np.log(at(roughness + aside)) for aside in (-ASIDE, ASIDE))
+        return at(roughness), (more - less) / (2 * ASIDE)
 
 
 def _whole_groups(group: np.ndarray, count: int, wanted: int, generator: np.random.Generator) -> np.ndarray:

@@ -114,7 +114,12 @@ def robust_residuals(target: np.ndarray, design: Design, found: FixedEffects, wi
     shortened so that half its square is the pseudo-Huber loss."""
     left = (target - design.explained(found))[:, None]
     residual = without_means(left, np.ones(len(target)), design.group, design.count)[:, 0] / width
-    return np.sign(residual) * np.sqrt(2 * (np.sqrt(1 + residual**2) - 1))
+    return np.sign(residual) * np.sqrt(2 * pseudo_huber(residual))
+
+
+def pseudo_huber(residual: np.ndarray) -> np.ndarray:
+    """Half the square of small residuals [N], and nearly the size of large ones."""
+    return np.sqrt(1 + residual**2) - 1
 
 
 def robust_losses(target: np.ndarray, design: Design, found: FixedEffects, width: float) -> np.ndarray:

@@ -107,6 +107,13 @@ def diffuse(samples: Samples) -> np.ndarray:
     return exposed & (samples.cos.numpy() > COS_MIN) & (samples.sin2.numpy() > HIGHLIGHT_SIN2)
 
 
+def dark(samples: Samples) -> np.ndarray:
+    """Bool [N]: samples that show too little light to tell any, and that a diffuse model would tell if they
+    did."""
+    faint = samples.color.amin(dim=1).numpy() <= DARK
+    return faint & (samples.cos.numpy() > COS_MIN) & (samples.sin2.numpy() > HIGHLIGHT_SIN2)
+
+
 def _coefficients(
     samples: Samples, vertex: np.ndarray, count: int
 ) -> tuple[float, float, float, tuple[str, ...]]:

@@ -83,7 +83,9 @@ def test_an_effect_that_gains_little_is_not_kept_beside_a_light_that_no_endoscop
     probe = Probe(brightened(samples, log_gain), twin, caster)
     plain, gained = probe.fit(Hypothesis()), probe.fit(Hypothesis(gain=True))
     assert probe.compare(plain, gained).keep
-    towards_the_sides = replace(gained.effects, coefficients=gained.effects.coefficients * [-1, 1, 1])
+    towards_the_sides = replace(
+        gained.effects, coefficients=gained.effects.coefficients * [-1, 1, 1, 1, 1, 1]
+    )
     assert not probe.compare(plain, replace(gained, effects=towards_the_sides)).keep
 
 

@@ -1,0 +1,104 @@
+"""Pixels as sightings of places on the surface, with the geometry that tells how each is lit."""
+
+from __future__ import annotations
+
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from endotwin.effects.vignetting import squared_radius
+from endotwin.light.guides import visible_from
+from endotwin.surface.vectors import unit
+
+if TYPE_CHECKING:
+    from endotwin.pixels.samples import Samples
+    from endotwin.surface.casting import Caster
+    from endotwin.twin import Twin
+
+
+class Sightings:
+    """N pixels and the vertices that they show.
+
+    Attributes:
+        samples: the pixels. vertex: int [N], numbered without gaps.
+    """
+
+    def __init__(self, samples: Samples, vertex: np.ndarray, twin: Twin, caster: Caster):
+        self.samples, self.vertex, self.twin, self.caster = samples, vertex, twin, caster
+
+    def __len__(self) -> int:
+        return len(self.vertex)
+
+    @cached_property
+    def frames(self) -> np.ndarray:
+        """The frames that the pixels come from, ascending."""
+        return np.unique(self.samples.frame.numpy())
+
+    @cached_property
+    def frame(self) -> np.ndarray:
+        """Position of each pixel's frame in ``frames``, int [N]."""
+        return np.searchsorted(self.frames, self.samples.frame.numpy())
+
+    @cached_property
+    def T_local_camera(self) -> np.ndarray:
+        """Poses of ``frames`` in the surface's frame, float64 [F, 4, 4]."""
+        views = self.samples.views
+        return views.T_local_camera[np.searchsorted(views.frames, self.frames)]
+
+    @cached_property
+    def points_mm(self) -> np.ndarray:
+        """Surface points in the camera frame, float32 [N, 3]."""
+        local = self.local_points_mm - self.T_local_camera[self.frame, :3, 3]
+        return np.einsum("nba,nb->na", self.T_local_camera[self.frame, :3, :3], local).astype(np.float32)
+
+    @cached_property
+    def normals(self) -> np.ndarray:
+        """Unit normals in the camera frame, float32 [N, 3]."""
+        turned = np.einsum("nba,nb->na", self.T_local_camera[self.frame, :3, :3], self.local_normals)
+        return unit(turned.astype(np.float32))
+
+    @cached_property
+    def local_points_mm(self) -> np.ndarray:
+        """Surface points in the surface's frame, float32 [N, 3]."""
+        return self._interpolated(self.twin.surface.vertices_mm)
+
+    @cached_property
+    def local_normals(self) -> np.ndarray:
+        """Normals in the surface's frame, float32 [N, 3]."""
+        return self._interpolated(self.twin.surface.normals)
+
+    def visible(self, guide_mm: np.ndarray, rows: np.ndarray | None = None) -> np.ndarray:
+        """Bool [N]: whether a guide [3] (camera frame) sees each pixel's point (or of those in ``rows``)."""
+        rows = np.arange(len(self)) if rows is None else rows
+        seen = np.empty(len(rows), bool)
+        order = np.argsort(self.frame[rows], kind="stable")
+        bounds = np.searchsorted(self.frame[rows][order], np.arange(len(self.frames) + 1))
+        for number, pose in enumerate(self.T_local_camera):
+            part = order[bounds[number] : bounds[number + 1]]
+            points_mm = self.points_mm[rows[part]]
+            seen[part] = visible_from(self.caster, pose, points_mm, guide_mm[None])[:, 0] > 0
+        return seen
+
+    def visible_to(self, guides_mm: np.ndarray) -> np.ndarray:
+        """Bool [N, K]: which of guides [K, 3] see each pixel's point."""
+        return np.stack([self.visible(guide) for guide in np.asarray(guides_mm, np.float32)], axis=1)
+
+    def lit(self, guides_mm: np.ndarray) -> np.ndarray:
+        """Bool [N]: whether any of guides [K, 3] sees each pixel's point."""
+        return self.visible_to(guides_mm).any(axis=1)
+
+    @cached_property
+    def shown(self) -> np.ndarray:
+        """Mean display value of each pixel, 0 … 1, [N]."""
+        return self.samples.color.numpy().mean(axis=1, dtype=np.float64) / 255
+
+    def _interpolated(self, per_vertex: np.ndarray) -> np.ndarray:
+        corners = per_vertex[self.twin.surface.triangles[self.samples.triangle.numpy()]]
+        return np.einsum("nk,nka->na", self.samples.barycentric.numpy(), corners)
+
+    @cached_property
+    def vignetting_column(self) -> np.ndarray:
+        """r² of each pixel, r = 1 at the middle of the image's longer side, [N]. No r⁴ beside it: light of
+        another exponent n is darker towards the rim in nearly the same way, and would lose its n to both."""
+        return squared_radius(self.twin.camera, self.samples.pixel.numpy())
