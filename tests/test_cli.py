@@ -448,6 +448,7 @@ def test_a_profile_is_replaced_by_the_next(endotwin, made, tmp_path):
         assert json.loads((tmp_path / "profile.json").read_text())["command"] == command[0]
 
 
+@pytest.mark.slow
 def test_a_twin_is_scored_and_fitted_from_where_one_stands_and_keeps_its_guests(
     endotwin, made, tmp_path, monkeypatch
 ):

@@ -447,6 +447,7 @@ def test_an_obj_and_all_it_refers_to_are_old_or_new_wherever_its_export_is_kille
     )
 
 
+@pytest.mark.slow
 def test_a_mitsuba_scene_is_replaced_with_its_guests_kept(twin, tmp_path):
     folder = tmp_path / "colon.mitsuba"
     export(twin, folder)

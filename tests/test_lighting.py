@@ -65,6 +65,7 @@ def test_a_frame_that_is_all_black_gets_a_gain_that_is_finite_and_leaves_the_oth
     np.testing.assert_allclose(np.diff(log_gain[:4]), np.diff(LOG_GAIN[:4]), atol=0.01)
 
 
+@pytest.mark.slow
 def test_a_guide_that_casts_no_shadow_is_found_behind_the_lens_from_a_millimetre_aside():
     true = ((2.0, -1.0, -0.8),)
     twin = tube_twin.fitted(tube_twin.seen(tube_twin.surface()))

@@ -110,6 +110,7 @@ def test_all_labels_of_moving_tissue_agree(twin, tmp_path):
     assert document["motion"]["peristalsis"]["amplitude"] == 2 and "breathing" in document["motion"]
 
 
+@pytest.mark.slow
 def test_flow_without_the_tissues_own_motion_would_not_agree(twin, tmp_path):
     """What the proof finds is the motion: with scene flow of 0, it breaks."""
     job = job_of(twin, [WAVES], "depth_exr,flow_npz,scene_flow")

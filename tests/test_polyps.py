@@ -368,6 +368,7 @@ def test_what_cannot_grow_is_refused_in_a_sentence(bare, spec, said):
     assert "\n" not in str(refused.value)
 
 
+@pytest.mark.slow
 def test_a_place_that_is_taken_and_a_hole_are_refused(bare):
     holed = tube_twin.fitted(tube_twin.seen(tube_twin.surface(holes=40)))
     refused = 0

@@ -210,7 +210,7 @@ def test_a_study_does_not_go_on_from_frames_that_were_changed(made, other, tmp_p
     [
         (["--parts", "headline,tail"], "tail"),
         (["--loss", "l2"], "huber"),
-        (["--network", "nowhere"], "weights of Depth Anything"),
+        pytest.param(["--network", "nowhere"], "weights of Depth Anything", marks=pytest.mark.slow),
         (["--seeds", "0"], "seeds"),
         (["--frames", "0"], "frames"),
         (["--steps", "-1"], "steps"),

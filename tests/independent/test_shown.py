@@ -41,6 +41,7 @@ def test_noise_is_shown_but_for_what_the_cells_take_up(scene: Scene, pixels: Pix
     assert pixels.left(noise, value, []) == pytest.approx(255 * np.sqrt(left), rel=0.02)
 
 
+@pytest.mark.slow
 def test_a_gain_shows_as_far_as_it_goes(scene: Scene) -> None:
     levels = []
     for gain in (1.0, 1.1, 1.21):
@@ -51,6 +52,7 @@ def test_a_gain_shows_as_far_as_it_goes(scene: Scene) -> None:
     assert levels[1] > 0.3
 
 
+@pytest.mark.slow
 def test_a_gain_of_each_frame_makes_q_harder_to_tell(scene: Scene) -> None:
     """Whoever flies straight ahead nears all tissue at once, as a gain would show it."""
     plain = wrong_levels(Studio(scene))

@@ -45,6 +45,7 @@ def test_depth_maps_of_two_frames_show_one_wall(tmp_path) -> None:
     assert np.median(error) < 0.01
 
 
+@pytest.mark.slow
 def test_a_scene_is_made_once_and_its_seed_tells_all_of_it(tmp_path) -> None:
     scene = replace(Scene.draw(0), lens=SMALL, frames=2).having(frozenset({"gain", "coat"}))
     made = make(scene, tmp_path / "a")
