@@ -38,7 +38,7 @@ def test_no_dots_remain_along_rims_in_the_held_out_renders_of_the_example(fused)
 
 
 def test_shadows_of_rims_leave_no_dots_where_photos_have_none(data_root):
-    twin = endotwin.fit_twin(endotwin.fuse_twin(data_root / "colon_offset"), budget_s=12)
+    twin = endotwin.fit_twin(endotwin.fuse_twin(data_root / "colon_offset"))
     assert "shadows" in twin.effects
     for render, photo in heldout(twin):
         assert not dots(render, photo).any()

@@ -69,16 +69,22 @@ class Decided:
 
 
 def decide(
-    samples: Samples, twin: Twin, caster: Caster, glints: Callable[[], Glints], wanted: Mapping[str, str]
+    samples: Samples,
+    twin: Twin,
+    caster: Caster,
+    glints: Callable[[], Glints],
+    wanted: Mapping[str, str],
+    late: Callable[[], bool] = lambda: False,
 ) -> Decided:
     """Decide the effects of the light from ``samples`` that tell it.
 
     Args:
         glints: those of the photos, looked for where guides are sought.
         wanted: auto, on or off by name of the effect; auto unless given.
+        late: whether guides are not to be sought a second time.
     """
     probe = Probe(samples, twin, caster)
-    trial = _Trial(probe, glints, wanted)
+    trial = _Trial(probe, glints, wanted, late)
     kept = trial.together()
     kept = trial.shadowed(kept)
     for name in BESIDE:
@@ -89,8 +95,14 @@ def decide(
 class _Trial:
     """Sets of effects about one probe, and what was decided of each effect."""
 
-    def __init__(self, probe: Probe, glints: Callable[[], Glints], wanted: Mapping[str, str]):
-        self._probe, self._glints, self._wanted = probe, cache(glints), wanted
+    def __init__(
+        self,
+        probe: Probe,
+        glints: Callable[[], Glints],
+        wanted: Mapping[str, str],
+        late: Callable[[], bool],
+    ):
+        self._probe, self._glints, self._wanted, self._late = probe, cache(glints), wanted, late
         self._decisions: dict[str, Decision] = {}
         self._seconds = dict.fromkeys((*TOGETHER, *BESIDE), 0.0)
         self._model, self._bouncing = cache(self._fitted), cache(self._bounced)
@@ -122,7 +134,7 @@ class _Trial:
         found_mm = found_guides(self._probe, base, self._glints(), self.wanted("offset") == "on")
         bounces = base.bounced is not None
         self._guides_mm = dict.fromkeys((False, True), found_mm)
-        if found_mm == AT_LENS or self.wanted("interreflection") != "auto":
+        if found_mm == AT_LENS or self.wanted("interreflection") != "auto" or self._late():
             return
         other = replace(base, bounced=None if bounces else self._bouncing(found_mm))
         other_mm = found_guides(self._probe, other, self._glints(), False)

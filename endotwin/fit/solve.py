@@ -142,7 +142,7 @@ def fit_twin(
         def glints() -> Glints:
             return Glints.of(samples[torch.from_numpy(smooth)], surface, start)
 
-        decided = decide(samples[every], twin, caster, glints, states)
+        decided = decide(samples[every], twin, caster, glints, states, pace.light_is_over)
         relighting = Relighting(surface, caster, decided.effects, samples.views)
         if decided.light is not None:
             start = start_at(
