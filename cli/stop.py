@@ -26,6 +26,8 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM)
 _heeded = Event()
 _told: list[int] = []
 """The exit code, once it was said that the command stops."""
+_put_off: list[int] = []
+"""Signals that came where none may interrupt."""
 
 
 class Stopped(BaseException):
@@ -47,7 +49,14 @@ def tell(stopped: Stopped) -> int:
 
 
 def end_if_told() -> None:
-    """End the process at once where it was stopped: graphics and tensors take seconds to be unloaded."""
+    """End the process at once where it was stopped, be it in the moment in which it ended by itself.
+
+    Graphics and tensors take seconds to be unloaded, and Python drops its handlers before the second try of
+    a signal that was put off.
+    """
+    if _put_off and not _told:
+        print("stopped", file=sys.stderr)
+        _told.append(128 + _put_off[0])
     if _told:
         with suppress(OSError):
             sys.stdout.flush()
@@ -80,6 +89,7 @@ def _stop(number: int, frame: FrameType | None) -> None:
     if not _within(frame, *UNINTERRUPTED):
         _heeded.set()
         raise Stopped(number)
+    _put_off.append(number)
     if hasattr(signal, "setitimer"):
         signal.signal(signal.SIGALRM, lambda _, later: _stop(number, later))
         signal.setitimer(signal.ITIMER_REAL, RETRY_S)
