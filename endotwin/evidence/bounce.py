@@ -7,7 +7,8 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from endotwin.evidence.probe import Bounced, Hypothesis, Probe
+from endotwin.evidence.log_light import Bounced
+from endotwin.evidence.probe import Hypothesis, Probe
 from endotwin.light.bounced import Albedo, BouncedLight, Places
 from endotwin.light.radiosity import Radiosity
 from endotwin.light.shading import F0_DIELECTRIC, ROUGHNESS_TISSUE, specular_albedo, specular_of_even_light

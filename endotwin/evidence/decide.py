@@ -28,7 +28,8 @@ from endotwin.effects.vignetting import Vignetting
 from endotwin.evidence.bounce import bounced, cell_mm
 from endotwin.evidence.glints import Glints
 from endotwin.evidence.guide_search import Guides, Search, found_guides
-from endotwin.evidence.probe import MIN_IMPOSSIBLE_DB, Bounced, Fitted, Hypothesis, Probe, Verdict
+from endotwin.evidence.log_light import Bounced
+from endotwin.evidence.probe import MIN_IMPOSSIBLE_DB, Fitted, Hypothesis, Probe, Verdict
 from endotwin.light.guides import AT_LENS, COSINE, EXPONENTIAL
 from endotwin.pixels.samples import Samples
 from endotwin.pixels.start import PRIOR
@@ -43,12 +44,10 @@ LEAST_GAIN, PLAIN_DB = 0.08, 3.0
 loss: the bounce from a mesh of what was seen errs by some 4 % of a frame's brightness. An automatic gain
 changes it by tens."""
 
-LEAST_BOUNCE = Verdict(0.1, 3.0)
-"""What bounced light has to gain: it has no coefficient of its own, and where there is none it loses."""
-
-LEAST_VIGNETTING = Verdict(0.05, 3.0)
-"""What vignetting has to gain: exponent and profile of the light say nearly the same, so that it can gain
-little; wrongly on, it is fitted to none."""
+LEAST = {"interreflection": Verdict(0.1, 3.0), "vignetting": Verdict(0.05, 3.0)}
+"""What an effect has to gain where the usual is too much: bounced light has no coefficient of its own, and
+where there is none it loses; exponent and profile of the light say nearly the same as vignetting, which can
+gain little, and wrongly on is fitted to none."""
 
 
 @dataclass(frozen=True)
@@ -167,17 +166,14 @@ class _Trial:
         other = self._mixed(kept) if name == "profile" else replace(kept.hypothesis, vignetting=True)
         other = self._probe.fit(other)
         verdict = self._probe.compare(kept, other)
-        on = self.wanted(name) == "on" or self._worth_beside(name, verdict)
+        on = self.wanted(name) == "on" or _worth(name, verdict)
         if on and other.hypothesis.guides_mm != AT_LENS:
             kept, other = self._settled(kept), self._settled(other)
             verdict = self._probe.compare(kept, other)
-            on = self.wanted(name) == "on" or self._worth_beside(name, verdict)
+            on = self.wanted(name) == "on" or _worth(name, verdict)
         self._say(name, on, verdict)
         self._seconds[name] += time.perf_counter() - began
         return other if on else kept
-
-    def _worth_beside(self, name: str, verdict: Verdict) -> bool:
-        return verdict.worth(LEAST_VIGNETTING) if name == "vignetting" else verdict.keep
 
     def _settled(self, model: Fitted) -> Fitted:
         """With its guides where they predict best beside all its effects, if that is elsewhere."""
@@ -241,16 +237,15 @@ class _Trial:
         while True:
             verdicts = {name: self._verdict(names - {name}, names) for name in names}
             unworthy = [name for name in names if self.wanted(name) == "auto"]
-            unworthy = [name for name in unworthy if not self._worth(name, names, verdicts[name])]
+            unworthy = [name for name in unworthy if not self._worth_within(names, name, verdicts[name])]
             if not unworthy:
                 return names, verdicts
             names = names - {min(unworthy, key=lambda name: verdicts[name].gain_db)}
 
-    def _worth(self, name: str, names: frozenset[str], verdict: Verdict) -> bool:
-        if name == "gain" and "interreflection" in names:
-            changes = float(self._model(names).log_gain.std()) >= LEAST_GAIN
-            return verdict.keep and (changes or verdict.gain_db >= PLAIN_DB)
-        return verdict.worth(LEAST_BOUNCE) if name == "interreflection" else verdict.keep
+    def _worth_within(self, names: frozenset[str], name: str, verdict: Verdict) -> bool:
+        told = name != "gain" or "interreflection" not in names or verdict.gain_db >= PLAIN_DB
+        told = told or float(self._model(names).log_gain.std()) >= LEAST_GAIN
+        return told and _worth(name, verdict)
 
     def _verdict(self, without: frozenset[str], names: frozenset[str]) -> Verdict:
         return self._probe.compare(self._model(without), self._model(names))
@@ -314,3 +309,7 @@ class _Trial:
         if hypothesis.vignetting:
             effects.append(Vignetting(k2=kept.vignetting))
         return Effects(effects)
+
+
+def _worth(name: str, verdict: Verdict) -> bool:
+    return verdict.worth(LEAST[name]) if name in LEAST else verdict.keep

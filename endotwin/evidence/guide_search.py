@@ -113,12 +113,12 @@ class Search:
         return [np.vstack([known_mm, candidate]) for candidate in self._candidates]
 
     def settled(self) -> Guides:
-        """The base's own guides, moved to where they predict best beside all that was kept since."""
+        """The base's own guides, moved to where they predict best beside its effects."""
         return self._refined(self._base.hypothesis.guides_mm, axes=3)
 
     def polished(self) -> Guides:
-        """The base's own guides, moved to where they predict best beside all that was kept since: in the
-        plane of the lens, then behind it, too."""
+        """As ``settled``, for guides that were sought in the plane of the lens; at last without derivatives,
+        for shadows jump."""
         within = self._refined(self._base.hypothesis.guides_mm)
         first = self._coordinates(self._refined(within, axes=3), axes=3)
         options = {

@@ -10,7 +10,7 @@ import torch
 from independent.light import burley, ggx
 
 from endotwin.config import STANDARD
-from endotwin.evidence.decide import LEAST_VIGNETTING
+from endotwin.evidence.decide import LEAST
 from endotwin.evidence.probe import Hypothesis, Probe
 from endotwin.evidence.sightings import Sightings
 from endotwin.pipeline import fuse_twin
@@ -59,7 +59,7 @@ def test_a_rough_lobe_bends_no_light_and_passes_for_no_other_effect(example, rou
     assert plain.tissue.roughness == pytest.approx(roughness, abs=0.1)
     others = (Hypothesis(gain=True), Hypothesis(profile=1.0), BESIDE)
     assert not any(probe.compare(plain, probe.fit(each)).keep for each in others)
-    assert not probe.compare(plain, probe.fit(Hypothesis(vignetting=True))).worth(LEAST_VIGNETTING)
+    assert not probe.compare(plain, probe.fit(Hypothesis(vignetting=True))).worth(LEAST["vignetting"])
 
 
 def test_a_pixel_that_shows_light_is_not_taken_to_lie_in_full_shadow(example):
