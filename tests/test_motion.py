@@ -11,6 +11,7 @@ import tube_twin
 
 import endotwin
 import endotwin.synth
+import endotwin.synth.motion.motion
 from endotwin.effects import Effects
 from endotwin.effects.interreflection import Interreflection
 from endotwin.effects.specular import Specular
@@ -193,6 +194,24 @@ def test_the_camera_rides_on_the_swaying_lumen_and_keeps_its_clearance(plain):
         reach = np.linalg.norm(surface.vertices_mm + surface.origin_mm - pose[:3, 3], axis=1).min()
         assert reach == pytest.approx(tube_twin.RADIUS_MM, abs=0.3)
     np.testing.assert_allclose(carried.checks["clearance_mm"], tube_twin.RADIUS_MM, atol=0.3)
+
+
+@pytest.mark.parametrize("few", [40, 20_000])
+def test_the_clearance_is_that_of_the_nearest_vertex_wherever_the_tissue_goes(plain, few, monkeypatch):
+    """Of cameras near the wall, at all depths of a breath that takes them along by half."""
+    monkeypatch.setattr(endotwin.synth.motion.motion, "FEW", few)
+    motion = parse_motion([WAVES, "breathing:follow=0.5"], plain)
+    near_wall = np.repeat(poses()[:1], 8, axis=0)
+    near_wall[:, :3, 3] += np.linspace(-4, 4, 8)[:, None] * near_wall[:, :3, 0]
+    times_s = np.linspace(0, 3, 8)
+    carried = motion.carried(Trajectory(near_wall, times_s, "near the wall"))
+    assert len(carried) == 8
+    for pose, time_s, clearance_mm in zip(
+        carried.T_world_camera, times_s, carried.checks["clearance_mm"], strict=True
+    ):
+        surface = motion.surface(time_s)
+        each_mm = np.linalg.norm(surface.vertices_mm + surface.origin_mm - pose[:3, 3], axis=1)
+        assert clearance_mm == pytest.approx(each_mm.min(), abs=1e-3)
 
 
 @pytest.mark.slow

@@ -14,8 +14,10 @@ ENDS = 1e-3
 
 def crossings(surface: Surface) -> np.ndarray:
     """Numbers, ascending, of triangles that an edge of another passes through, int [K]."""
-    pairs = np.sort(surface.triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
-    edges = np.unique(pairs, axis=0)
+    one, other = surface.triangles[:, [0, 1, 2]].ravel(), surface.triangles[:, [1, 2, 0]].ravel()
+    vertices = np.int64(len(surface.vertices_mm))
+    pairs = np.sort(np.minimum(one, other) * vertices + np.maximum(one, other))
+    edges = np.stack(np.divmod(pairs[np.diff(pairs, prepend=-1) > 0], vertices), axis=1)
     start, end = (surface.vertices_mm[edges[:, k]] for k in range(2))
     towards = end - start
     length_mm = np.linalg.norm(towards, axis=1)

@@ -42,6 +42,10 @@ PART = 1 << 14
 NEAR = 3.0
 """Wall within so many radii of the lumen is searched for what is nearest to a camera."""
 
+FEW, SLACK_MM = 20_000, 1.0
+"""Vertices, evenly chosen, that tell how much nearer to a camera tissue comes; and how much nearer others may
+come still."""
+
 
 @dataclass(frozen=True, eq=False)
 class Motion:
@@ -126,8 +130,9 @@ class Motion:
             moves = moved(self.rest.vertices_mm, self.places, shift, M) - self.rest.vertices_mm
             far_mm[k] = np.abs(moves - moves.mean(axis=0)).max()
         worst = float(probed[far_mm.argmax()])
-        at_rest, then = len(crossings(self.rest)), len(crossings(self.surface(worst)))
-        if then > MORE * at_rest + FLAWS * len(self.rest.triangles):
+        then, flaws = len(crossings(self.surface(worst))), FLAWS * len(self.rest.triangles)
+        at_rest = len(crossings(self.rest)) if then > flaws else 0
+        if then > MORE * at_rest + flaws:
             raise OptionError(
                 f"motion makes {then} triangles cross others at {worst:.2f} s, where {at_rest} do at rest; "
                 "lower its amplitude, or widen its waves"
@@ -145,11 +150,16 @@ class Motion:
     def _tree(self) -> cKDTree:
         return cKDTree(self.rest.vertices_mm)
 
+    @cached_property
+    def _few(self) -> tuple[np.ndarray, Places]:
+        """FEW of the vertices at rest, [F, 3], and their places."""
+        chosen = slice(None, None, max(len(self.rest.vertices_mm) // FEW, 1))
+        return self.rest.vertices_mm[chosen], self.places[chosen]
+
     def _ridden(self, T_world_camera: np.ndarray, time_s: float) -> tuple[np.ndarray, float]:
         """The pose [4, 4] where the lumen takes it, and how far it is then from the nearest vertex, mm."""
         shift, M = self._bent(time_s)
         (centre,) = self.rest.to_local(T_world_camera[None])[:, :3, 3]
-        near = np.array(self._tree.query_ball_point(centre, NEAR * np.median(self.line.radius_mm)), int)
         follow = min((each.follow for each in self.kinds if isinstance(each, Breathing)), default=0.0)
         place = Places.of(self.line, centre[None])
         turn = place.of_table(M / np.cbrt(np.linalg.det(M))[:, None, None])[0]
@@ -158,10 +168,26 @@ class Motion:
         pose[:3, 3] += follow * (to - centre)
         turned_by = follow * Rotation.from_matrix(turn).as_rotvec()
         pose[:3, :3] = Rotation.from_rotvec(turned_by).as_matrix() @ pose[:3, :3]
+        now = pose[:3, 3] - self.rest.origin_mm
+        return pose, self._clearance_mm(centre, now, shift, M)
+
+    def _clearance_mm(self, before: np.ndarray, now: np.ndarray, shift: np.ndarray, M: np.ndarray) -> float:
+        """How far the nearest vertex, moved, is from ``now`` [3], where a camera is that was at ``before``;
+        inf where the wall was far from there.
+
+        Some vertices tell how far that is at most, and how much nearer tissue comes: what was farther away
+        than both together is not the nearest.
+        """
+        points, places = self._few
+        rest_mm = np.linalg.norm(points - before, axis=1)
+        near = np.flatnonzero(rest_mm < NEAR * np.median(self.line.radius_mm))
         if not len(near):
-            return pose, np.inf
-        wall = moved(self.rest.vertices_mm[near], self.places[near], shift, M)
-        return pose, float(np.linalg.norm(wall - (pose[:3, 3] - self.rest.origin_mm), axis=1).min())
+            return np.inf
+        then_mm = np.linalg.norm(moved(points[near], places[near], shift, M) - now, axis=1)
+        nearer_mm = max((rest_mm[near] - then_mm).max(), 0.0) + SLACK_MM
+        asked = self._tree.query_ball_point(before, then_mm.min() + nearer_mm)
+        wall = moved(self.rest.vertices_mm[asked], self.places[asked], shift, M)
+        return float(np.linalg.norm(wall - now, axis=1).min())
 
 
 def parse_motion(specs: Iterable[str] | str, twin: Twin) -> Motion | None:

@@ -9,6 +9,7 @@ gives the new centre, and a smoothing spline the new line.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from scipy.interpolate import BSpline, make_smoothing_spline
@@ -35,6 +36,9 @@ ENDS_MIN = 0.75
 
 STEPS = 8
 """Stations a radius."""
+
+SPACING_MM = 0.5
+"""Between the points of the line that is found."""
 
 GAP = 9
 """Stations that may lack a wall within the line, less one: about a radius, the blind side of a fold."""
@@ -70,7 +74,7 @@ class Centerline:
         return self.length_mm / (len(self.points_mm) - 1)
 
 
-def find_centerline(lumen: Lumen, spacing_mm: float = 0.5) -> Centerline:
+def find_centerline(lumen: Lumen) -> Centerline:
     """The centreline of the part of the lumen whose wall was photographed (of all of it, if nothing was).
 
     It runs the way the training cameras looked: towards the wall that they only saw from afar.
@@ -78,6 +82,17 @@ def find_centerline(lumen: Lumen, spacing_mm: float = 0.5) -> Centerline:
     Raises:
         TrajectoryError: the mesh encloses no lumen that a line could follow.
     """
+    surface = lumen.surface
+    if surface not in _found:
+        _found[surface] = _sought(lumen)
+    return _found[surface]
+
+
+_found: WeakKeyDictionary[Surface, Centerline] = WeakKeyDictionary()
+"""A trajectory and a motion ask for the line of the same surface."""
+
+
+def _sought(lumen: Lumen) -> Centerline:
     surface = lumen.surface
     covered = _covered(surface)
     line = _rough_line(lumen, covered)
@@ -93,7 +108,7 @@ def find_centerline(lumen: Lumen, spacing_mm: float = 0.5) -> Centerline:
             )
         line = _smooth(stations, float(np.median(radius_mm)), share**2)
     arc = arc_length(line)
-    even = np.linspace(0, arc[-1], max(int(arc[-1] / spacing_mm) + 1, 5))
+    even = np.linspace(0, arc[-1], max(int(arc[-1] / SPACING_MM) + 1, 5))
     points = np.stack([np.interp(even, arc, axis) for axis in line.T], axis=1)
     radius_mm = np.interp(even / even[-1], np.linspace(0, 1, len(radius_mm)), radius_mm)
     if _looks_backward(surface, points):
