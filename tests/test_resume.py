@@ -288,3 +288,22 @@ def test_a_run_killed_after_the_dataset_got_its_place_is_tidied_up(twin, whole, 
     render(twin, tmp_path / "dataset")
     assert not partial_path(tmp_path / "dataset").exists()
     assert contents(tmp_path / "dataset") == whole
+
+
+@pytest.mark.parametrize("workers", [2, 3])
+@pytest.mark.parametrize("left", [range(40), [0, 3, 4, 5, 9, 20, 21, 22, 23, 24, 25]], ids=["new", "resumed"])
+def test_workers_of_any_speed_do_every_shard_once_and_mostly_the_one_after_their_last(workers, left):
+    left, generator = list(left), np.random.default_rng(0)
+    pending, done, at_work, followed = list(left), [], {}, 0
+    for worker in range(workers):
+        at_work[worker] = crew.next_shard(pending, None, at_work.values())
+        pending.remove(at_work[worker])
+    while pending:
+        worker = int(generator.integers(workers))
+        done.append(at_work.pop(worker))
+        at_work[worker] = crew.next_shard(pending, done[-1], at_work.values())
+        pending.remove(at_work[worker])
+        followed += at_work[worker] == done[-1] + 1
+    assert sorted([*done, *at_work.values()]) == left
+    could = sum(number + 1 in left for number in left)
+    assert followed >= could - 2 * workers

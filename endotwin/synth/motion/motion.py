@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
 from functools import cached_property
 
 import numpy as np
@@ -15,7 +15,7 @@ from endotwin.errors import OptionError, TrajectoryError
 from endotwin.surface import Surface
 from endotwin.synth.motion.crossing import crossings
 from endotwin.synth.motion.kinds import KINDS, Breathing, Peristalsis
-from endotwin.synth.motion.tube import Line, Places, moved, turned
+from endotwin.synth.motion.tube import Carried, Line, Places
 from endotwin.synth.trajectories import Trajectory
 from endotwin.synth.trajectories.centerline import find_centerline
 from endotwin.synth.trajectories.lumen import Lumen
@@ -35,9 +35,6 @@ PROBES = 8
 FLAWS, MORE = 1e-4, 1.1
 """Share of the vertices that may be folded, and of the triangles that may cross others, beside MORE of those
 that do at rest: a fused mesh has slivers, and layers that nearly touch."""
-
-PART = 1 << 14
-"""Vertices that are moved at once: what is made on the way stays in the cache, in a third of the time."""
 
 NEAR = 3.0
 """Wall within so many radii of the lumen is searched for what is nearest to a camera."""
@@ -68,14 +65,8 @@ class Motion:
     def surface(self, time_s: float) -> Surface:
         """The surface at ``time_s``: vertices and normals of the one at rest as they are then."""
         shift, M = self._bent(time_s)
-        rest = self.rest
-        vertices_mm, normals = np.empty_like(rest.vertices_mm), np.empty_like(rest.normals)
-        for start in range(0, len(vertices_mm), PART):
-            part = slice(start, start + PART)
-            places = self.places[part]
-            vertices_mm[part] = moved(rest.vertices_mm[part], places, shift, M)
-            normals[part] = turned(rest.normals[part], places, self.line, shift, M)[0]
-        return replace(rest, vertices_mm=vertices_mm, normals=normals)
+        vertices = self._vertices
+        return replace(self.rest, vertices_mm=vertices.moved(shift, M), normals=vertices.turned(shift, M)[0])
 
     def carried(self, trajectory: Trajectory) -> Trajectory:
         """The trajectory on which the moving lumen takes the camera along, without the poses that its wall
@@ -122,12 +113,12 @@ class Motion:
         for k, time_s in enumerate(probed):
             narrowest = 1 - (self._contraction(time_s) / self.line.radius_mm).max()
             shift, M = self._bent(time_s)
-            _, space = turned(self.rest.normals, self.places, self.line, shift, M)
+            space = self._vertices.turned(shift, M)[1]
             if narrowest < NARROWEST or (space <= 0).mean() > FLAWS:
                 raise OptionError(
                     f"motion folds the tissue at {time_s:.2f} s; lower its amplitude, or widen its waves"
                 )
-            moves = moved(self.rest.vertices_mm, self.places, shift, M) - self.rest.vertices_mm
+            moves = self._vertices.moved(shift, M) - self.rest.vertices_mm
             far_mm[k] = np.abs(moves - moves.mean(axis=0)).max()
         worst = float(probed[far_mm.argmax()])
         then, flaws = len(crossings(self.surface(worst))), FLAWS * len(self.rest.triangles)
@@ -149,6 +140,14 @@ class Motion:
     @cached_property
     def _tree(self) -> cKDTree:
         return cKDTree(self.rest.vertices_mm)
+
+    @cached_property
+    def _vertices(self) -> Carried:
+        return Carried(self.line, self.places, self.rest.vertices_mm, self.rest.normals)
+
+    def __getstate__(self) -> dict:
+        """What it was made of: what was found on the way is soon found again."""
+        return {field.name: getattr(self, field.name) for field in fields(self)}
 
     @cached_property
     def _few(self) -> tuple[np.ndarray, Places]:
@@ -183,10 +182,10 @@ class Motion:
         near = np.flatnonzero(rest_mm < NEAR * np.median(self.line.radius_mm))
         if not len(near):
             return np.inf
-        then_mm = np.linalg.norm(moved(points[near], places[near], shift, M) - now, axis=1)
+        then_mm = np.linalg.norm(Carried(self.line, places[near], points[near]).moved(shift, M) - now, axis=1)
         nearer_mm = max((rest_mm[near] - then_mm).max(), 0.0) + SLACK_MM
         asked = self._tree.query_ball_point(before, then_mm.min() + nearer_mm)
-        wall = moved(self.rest.vertices_mm[asked], self.places[asked], shift, M)
+        wall = Carried(self.line, self.places[asked], self.rest.vertices_mm[asked]).moved(shift, M)
         return float(np.linalg.norm(wall - now, axis=1).min())
 
 

@@ -12,8 +12,10 @@ from typing import Self
 
 import numpy as np
 import scipy.sparse
+import torch
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
+from torch.nn.functional import embedding_bag
 
 from endotwin.surface import Surface
 from endotwin.surface.vectors import dot, unit
@@ -107,41 +109,57 @@ class Places:
         low = table.take(self.below, axis=0)
         return low + share * (table.take(self.below + 1, axis=0) - low)
 
-    def columns(self, table: np.ndarray) -> np.ndarray:
-        """As ``of_table``, of a table [S, C], float32 [C, N]: products by columns take half the time."""
-        return np.ascontiguousarray(self.of_table(table.astype(np.float32)).T)
+
+class Sums:
+    """Sums Σₖ factor[k]·row[k] at N points of K rows of three that each station of the line has."""
+
+    def __init__(self, places: Places, *factors: np.ndarray):
+        """``factors``: float32 [N, K] in all, side by side."""
+        factor = np.concatenate(factors, axis=1)
+        self._rows = factor.shape[1]
+        share = places.share[:, None]
+        self._weight = torch.from_numpy(np.concatenate([(1 - share) * factor, share * factor], axis=1))
+        both = np.arange(2 * self._rows, dtype=np.int32)
+        self._index = torch.from_numpy(places.below[:, None] * np.int32(self._rows) + both)
+
+    def __call__(self, rows: np.ndarray) -> np.ndarray:
+        """Of ``rows`` [S, K, 3], float32 [N, 3]."""
+        table = torch.from_numpy(rows.astype(np.float32).reshape(-1, 3))
+        return embedding_bag(self._index, table, mode="sum", per_sample_weights=self._weight).numpy()
 
 
-def moved(points: np.ndarray, places: Places, shift: np.ndarray, M: np.ndarray) -> np.ndarray:
-    """Where ``points`` float32 [N, 3] go, float32 [N, 3]."""
-    table = np.concatenate([shift, (M - np.eye(3)).reshape(len(M), 9)], axis=1)
-    at = places.columns(table)
-    return points + np.stack(at[:3] + _times(at[3:], places.across.T), axis=1)
+class Carried:
+    """Points float32 [N, 3] that the tissue takes along, with ``normals`` [N, 3] if given."""
+
+    def __init__(self, line: Line, places: Places, points: np.ndarray, normals: np.ndarray | None = None):
+        self._line, self._places, self._points = line, places, points
+        self._across = Sums(places, np.ones((len(points), 1), np.float32), places.across)
+        if normals is not None:
+            self._along, self._slope = Sums(places, normals), Sums(places, places.slope)
+
+    def moved(self, shift: np.ndarray, M: np.ndarray) -> np.ndarray:
+        """Where the points go, float32 [N, 3]."""
+        return self._points + self._across(_stacked(shift, M - np.eye(3)))
+
+    def turned(self, shift: np.ndarray, M: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Unit normals [N, 3] of the moved surface, and the space about it, [N]: below 0 where it is folded.
+
+        The map's gradient is J = M + w·∇sᵀ, w = u' + M'·r − (M − 1)·t, and a normal goes to J⁻ᵀ·n (by
+        Sherman & Morrison, with M⁻ᵀ = M/f²).
+        """
+        line = self._line
+        step_mm = line.s_mm[1] - line.s_mm[0]
+        rates = [np.gradient(table, step_mm, axis=0) for table in (shift, M)]
+        own = np.einsum("sij,sj->si", M - np.eye(3), line.tangents)
+        w, rows = self._across(_stacked(rates[0] - own, rates[1])), M.transpose(0, 2, 1)
+        normals, slope = self._along(rows), self._slope(rows)
+        space = self._places.of_table((M[:, 0] ** 2).sum(axis=1).astype(np.float32)) + dot(slope, w)
+        return unit(normals - slope * (dot(w, normals) / space)[:, None]), space
 
 
-def turned(
-    normals: np.ndarray, places: Places, line: Line, shift: np.ndarray, M: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Unit normals [N, 3] of the moved surface, and the space about it, [N]: below 0 where it is folded.
-
-    The map's gradient is J = M + w·∇sᵀ, w = u' + M'·r − (M − 1)·t, and a normal goes to J⁻ᵀ·n (by Sherman &
-    Morrison, with M⁻ᵀ = M/f²).
-    """
-    step_mm = line.s_mm[1] - line.s_mm[0]
-    rates = [np.gradient(table, step_mm, axis=0) for table in (shift, M)]
-    own = np.einsum("sij,sj->si", M - np.eye(3), line.tangents)
-    at = places.columns(np.concatenate([rates[0] - own, rates[1].reshape(-1, 9), M.reshape(-1, 9)], axis=1))
-    w = at[:3] + _times(at[3:12], places.across.T)
-    turned_normals, slope = _times(at[12:], normals.T), _times(at[12:], places.slope.T)
-    squared_f, inward = (at[12::3] ** 2).sum(axis=0), (w * turned_normals).sum(axis=0)
-    space = squared_f + (slope * w).sum(axis=0)
-    return unit(np.stack(turned_normals - slope * (inward / space), axis=1)), space
-
-
-def _times(matrices: np.ndarray, vectors: np.ndarray) -> np.ndarray:
-    """Products [3, N] of matrices [9, N], row by row, with vectors [3, N]."""
-    x, y, z = vectors
-    return np.stack([matrices[k] * x + matrices[k + 1] * y + matrices[k + 2] * z for k in (0, 3, 6)])
+def _stacked(u: np.ndarray, M: np.ndarray) -> np.ndarray:
+    """Rows [S, 4, 3] whose sum by the factors 1, x, y, z is u + M·(x, y, z), of u [S, 3] and M [S, 3, 3]."""
+    return np.concatenate([u[:, None], M.transpose(0, 2, 1)], axis=1)
 
 
 def _turn(one: np.ndarray, other: np.ndarray) -> np.ndarray:

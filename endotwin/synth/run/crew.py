@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import logging
 import pickle
-from collections.abc import Iterable, Iterator
-from concurrent.futures import FIRST_COMPLETED, CancelledError, wait
+from collections.abc import Collection, Iterable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, wait
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
 from threading import Lock
 
+import numpy as np
 import torch
 from threadpoolctl import threadpool_limits
 
@@ -37,12 +38,34 @@ def render_in_processes(job: Job, folder: Path, shards: Iterable[int], workers: 
     sent = folder / DONE / "job.pickle"
     with sent.open("wb") as file:
         pickle.dump(job, file, pickle.HIGHEST_PROTOCOL)
+    left = sorted(shards)
     with Pool(workers, _enlist, sent, folder) as pool:
-        tasks = {pool.submit(_work, number): number for number in shards}
+        tasks: dict[Future, int] = {}
+
+        def hand_out(after: int | None = None) -> None:
+            number = next_shard(left, after, tasks.values())
+            left.remove(number)
+            tasks[pool.submit(_work, number)] = number
+
+        for _ in range(min(workers, len(left))):
+            hand_out()
         while tasks:
             for task in wait(tasks, return_when=FIRST_COMPLETED).done:
+                number = tasks.pop(task)
                 task.result()
-                yield tasks.pop(task)
+                if left:
+                    hand_out(number)
+                yield number
+
+
+def next_shard(left: Sequence[int], after: int | None, at_work: Collection[int]) -> int:
+    """Which of the shards that are ``left``, ascending, the worker that did ``after`` does next: the one that
+    follows, whose first frames see what it has kept; else, of the longest run, the first, or the one in the
+    middle where a worker is coming from the front."""
+    if after is not None and after + 1 in left:
+        return after + 1
+    run = max(np.split(left, np.flatnonzero(np.diff(left) != 1) + 1), key=len)
+    return int(run[len(run) // 2] if run[0] - 1 in at_work else run[0])
 
 
 def render_on_cluster(job: Job, folder: Path, shards: Iterable[int], scheduler: str) -> Iterator[int]:
