@@ -8,6 +8,7 @@ from io import BytesIO
 
 import numpy as np
 import tifffile
+import torch
 
 from endotwin.sequence.readers.c3vd import DEPTH_RANGE_MM
 from endotwin.synth.containers import channels, deflated_tiff, exr, npz, pixels, png, tiff
@@ -66,8 +67,8 @@ def encode_flow(flow_px: np.ndarray) -> np.ndarray:
     inside = (np.abs(x) <= FLOW_RANGE_PX) & (np.abs(y) <= FLOW_RANGE_PX)
     coded = np.zeros((*inside.shape, 3), np.uint16)
     for channel, values in enumerate((x, y)):
-        raw = np.rint((np.where(inside, values, 0) + FLOW_RANGE_PX) * np.float32(UINT16 / 2 / FLOW_RANGE_PX))
-        coded[..., channel] = np.where(inside, np.maximum(raw, 1), 0)
+        raw = np.rint((values + np.float32(FLOW_RANGE_PX)) * np.float32(UINT16 / 2 / FLOW_RANGE_PX))
+        coded[..., channel] = np.fmin(np.fmax(raw, 1), UINT16) * inside
     return coded
 
 
@@ -103,7 +104,8 @@ def plane(image: np.ndarray, channel: int) -> np.ndarray:
 
 def half(radiance: np.ndarray) -> np.ndarray:
     """Values as float16, to the nearest; those beyond its range are clipped."""
-    return np.minimum(radiance, np.float32(HALF_MAX)).astype(np.float16, order="C")
+    values = torch.from_numpy(np.ascontiguousarray(radiance, np.float32))  # NumPy takes ten times as long
+    return values.clamp(max=HALF_MAX).half().numpy()
 
 
 def depth_png(levels_per_mm: float, words: str) -> Encoding:

@@ -7,6 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
+from endotwin.run.ahead import ahead
+from endotwin.run.threads import THREADS
 from endotwin.synth.proof.between import between
 from endotwin.synth.proof.claims import Proof, Tally
 from endotwin.synth.proof.warp import Frame
@@ -32,16 +34,16 @@ def prove(
     written = dataset if isinstance(dataset, Written) else Written.open(dataset)
     firsts = _spread(max(len(written) - 1, 1), pairs)
     tally, kept = Tally(), Frame(written, int(firsts[0]))
+    threads = 1 if written.layout.packed else THREADS  # a tar is read at one place at a time
     try:
         for done, first in enumerate(firsts, 1):
             one = kept if kept.index == first else Frame(written, int(first))
-            if one is not kept or done == 1:
-                tally.add(within(one))
+            judging = [within(one)] if one is not kept or done == 1 else []
             if first + 1 < len(written):
                 kept = Frame(written, int(first) + 1)
-                tally.add(within(kept))
-                tally.add(between(one, kept))
-                tally.add(between(kept, one))
+                judging += [within(kept), between(one, kept), between(kept, one)]
+            for judged in ahead(list, judging, threads):
+                tally.add(judged)
             if progress:
                 progress("prove", done, len(firsts))
     finally:
