@@ -196,7 +196,7 @@ def test_the_camera_rides_on_the_swaying_lumen_and_keeps_its_clearance(plain):
     np.testing.assert_allclose(carried.checks["clearance_mm"], tube_twin.RADIUS_MM, atol=0.3)
 
 
-@pytest.mark.parametrize("few", [40, 20_000])
+@pytest.mark.parametrize("few", [40, 5000])
 def test_the_clearance_is_that_of_the_nearest_vertex_wherever_the_tissue_goes(plain, few, monkeypatch):
     """Of cameras near the wall, at all depths of a breath that takes them along by half."""
     monkeypatch.setattr(endotwin.synth.motion.motion, "FEW", few)

@@ -39,7 +39,7 @@ that do at rest: a fused mesh has slivers, and layers that nearly touch."""
 NEAR = 3.0
 """Wall within so many radii of the lumen is searched for what is nearest to a camera."""
 
-FEW, SLACK_MM = 20_000, 1.0
+FEW, SLACK_MM = 5000, 1.0
 """Vertices, evenly chosen, that tell how much nearer to a camera tissue comes; and how much nearer others may
 come still."""
 
