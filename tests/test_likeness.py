@@ -1,5 +1,6 @@
 """Effects as strong as another recording shows them."""
 
+import shutil
 from dataclasses import replace
 
 import cv2
@@ -10,6 +11,7 @@ import tube_twin
 
 import endotwin
 from endotwin.effects import Effects, parse_states
+from endotwin.effects.codec import Codec
 from endotwin.effects.noise import Noise
 from endotwin.errors import OptionError, SequenceError
 from endotwin.synth import equipped
@@ -35,10 +37,23 @@ def twin():
     return tube_twin.fitted(tube_twin.seen(tube_twin.surface()))
 
 
-def test_noise_is_on_and_as_strong_as_in_the_other_recording(twin, noisy):
+def test_noise_is_on_and_as_strong_as_in_the_other_recording(twin, noisy, caplog):
     effects = equipped(twin, {"like": str(noisy)}, "").effects
     assert effects["noise"].sigma(0.5) == pytest.approx(SIGMA, rel=0.2)
+    assert "codec" not in effects
+    (told,) = caplog.messages
+    assert "tell of noise; of" in told and "codec, " in told.split("; of")[1]
     assert "noise" not in equipped(twin, {"like": str(noisy), "noise": "off"}, "").effects
+
+
+def test_a_recording_of_jpeg_files_is_coded_as_they_are(twin, noisy, tmp_path):
+    folder = tmp_path / "coded"
+    shutil.copytree(noisy, folder)
+    for file in folder.glob("*color.png"):
+        photo = cv2.imread(str(file))
+        file.unlink()
+        cv2.imwrite(str(file.with_suffix(".jpg")), photo, [cv2.IMWRITE_JPEG_QUALITY, 40])
+    assert equipped(twin, {"like": str(folder)}, "").effects["codec"] == Codec(40)
 
 
 def test_it_takes_the_place_of_the_twins_own(twin, noisy):

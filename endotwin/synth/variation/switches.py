@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterable, Mapping
 from dataclasses import fields, replace
 
@@ -15,6 +16,8 @@ from endotwin.light.guides import AT_LENS
 from endotwin.sequence.readers import open_sequence
 from endotwin.synth.variation.edits import OFFSETS, Edit
 from endotwin.twin import Twin
+
+logger = logging.getLogger("endotwin")
 
 SUCCESSIVE = ("motion_blur", "rolling_shutter", "interlacing", "auto_gain")
 
@@ -54,9 +57,16 @@ def equipped(twin: Twin, states: Mapping[str, str], trajectory: object) -> Twin:
         )
     effects = twin.effects.without([name for name, state in states.items() if state == "off"])
     if sequence is not None:
-        shown = (effect_class(name).evidence(sequence)[0] for name in RENDERED if name not in states)
-        for effect in filter(None, shown):
+        asked = [name for name in RENDERED if name not in states]
+        shown = [effect for name in asked if (effect := effect_class(name).evidence(sequence)[0])]
+        for effect in shown:
             effects = effects.including(effect)
+        told = [effect.name for effect in shown]
+        silent = [name for name in asked if name not in told]
+        logger.warning(
+            "the photos of %s tell of %s; of %s they do not, so those are as the twin has them",
+            *(like, " and ".join(told) or "no effect", ", ".join(silent)),
+        )
     for name, state in states.items():
         if state != "on" or name in effects:
             continue
