@@ -19,6 +19,7 @@ from endotwin.light import shading
 from endotwin.light.forward import Lit
 from endotwin.light.incidence import to_camera
 from endotwin.render.illumination import Illumination, ViewLight
+from endotwin.render.sparkles import sparkles
 from endotwin.run.threads import THREADS
 from endotwin.sequence.poses import as_poses
 from endotwin.surface.casting import Caster, Correspondences
@@ -207,6 +208,9 @@ class Renderer:
         dark[met.edges] = ~radiance[met.edges].any(axis=1)
         told &= ~_alone(dark)
         _close_slits(radiance, told, met.edges)
+        if "sparkle" in self.twin.effects:
+            seen = met.centres.hits
+            radiance += sparkles(light, self.camera, laid_out(seen.distance_mm, seen.pixel, shape))[..., None]
         radiance *= self._exposure * exposure
         if self._transmission is not None:
             radiance *= self._transmission
