@@ -57,6 +57,7 @@ def added(twin, effects: list, pose: np.ndarray = POSE) -> np.ndarray:
     return np.subtract(*views)[..., 0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("light", [[], [GUIDES], [GUIDES, Shadows()]], ids=["lens", "guides", "shadows"])
 def test_many_facets_shine_together_as_the_smooth_lobe_of_their_spread_does(bare, light):
     facets = added(bare, [Sparkle(weight=3.0, density=2e4, spread=0.7, roughness=0.2), *light])
@@ -66,6 +67,7 @@ def test_many_facets_shine_together_as_the_smooth_lobe_of_their_spread_does(bare
     np.testing.assert_allclose(*blocks, rtol=0.1, atol=0.03 * smooth.mean())
 
 
+@pytest.mark.slow
 def test_how_dense_facets_are_changes_how_bright_each_is_and_not_their_mean(bare):
     poses = [facing(0.2 + 0.08 * k) for k in range(12)]
     few, many = (

@@ -19,7 +19,7 @@ import numpy as np
 import torch
 from scipy import ndimage
 from scipy.optimize import minimize
-from scipy.special import exp1
+from scipy.special import exp1, xlogy
 
 from endotwin.cameras.base import solid_angle
 from endotwin.effects import Decision
@@ -28,7 +28,7 @@ from endotwin.fit.film import APART, GLINT, REACH_PX, Model, Report
 from endotwin.fit.film import Found as FoundFilm
 from endotwin.fit.lighting import lit
 from endotwin.light import shading
-from endotwin.light.film import film_in_view, mirrors, mirrors_in_view
+from endotwin.light.film import Film, film_in_view, mirrors, mirrors_in_view
 from endotwin.light.guides import AT_LENS
 from endotwin.pixels.samples import CLIPPED, Samples, Views, frame_samples
 from endotwin.run.ahead import ahead
@@ -45,7 +45,7 @@ LEAST = 30
 """Fewer sparkles tell too little of where they stand."""
 
 LEAST_NATS = 5.0
-"""Of log-likelihood by which they must stand about the mirror direction, rather than anywhere."""
+"""Of log-likelihood by which they must stand on the film and where it mirrors, rather than anywhere."""
 
 STEEPEST = 60.0
 """Degrees between half vector and normal beyond which a normal is a rim's, and tells nothing."""
@@ -83,7 +83,7 @@ def sparkle(
     effect, nats = found.measured(views.camera.height) if told else (Sparkle(weight=0.0), 0.0)
     reason = f"{len(found)} small highlights of {found.area_mm2 / 100:.0f} cm² of photos are not the film's"
     if told:
-        reason += f", {effect.density:.2g} facets a mm², about the mirror direction by {nats:.0f} nats"
+        reason += f", {effect.density:.2g} facets a mm², on the film and where it mirrors by {nats:.0f} nats"
     state = "on" if wanted == "on" or (told and nats > LEAST_NATS) else "off"
     reason = f"forced on; {reason}" if wanted == "on" else reason
     decision = Decision(state, reason, fit_s=round(time.perf_counter() - began, 3))
@@ -176,6 +176,7 @@ class _Places:
     Attributes:
         slope2: [N, K], squared slope of the half vector about the surface's normal. cos_i, gain: [N, K],
             n·ωi, and what B̄ is of for a Smith factor and a coefficient of 1. cos_o, least, area_mm2: [N].
+            wet: bool [N], those on the film; all of them without one.
     """
 
     slope2: np.ndarray
@@ -184,9 +185,10 @@ class _Places:
     cos_o: np.ndarray
     least: np.ndarray
     area_mm2: np.ndarray
+    wet: np.ndarray
 
     @classmethod
-    def of(cls, model: Model, photo: _Photo, index: np.ndarray) -> _Places:
+    def of(cls, model: Model, photo: _Photo, index: np.ndarray, film: Film | None) -> _Places:
         """Of the samples ``index`` [N] of a photo."""
         samples, shared = photo.samples[torch.from_numpy(index)], model.state.shared
         points_mm, normals = samples.points_mm, samples.normals(model.twin.surface)
@@ -198,7 +200,9 @@ class _Places:
         seen_mm2 = dot(points_mm, points_mm) * solid_angle(samples.views.camera, _uv(samples))
         gain = strength.numpy() * cos_i.numpy() * (cos_o * _exposure(samples) / seen_mm2)[:, None]
         gain = shading.F0_WATER * gain / cos_m**4
-        return cls(1 / cos_m**2 - 1, cos_i.numpy(), gain, cos_o, photo.least[index], seen_mm2 / cos_o)
+        corners = model.twin.surface.triangles[samples.triangle.numpy()]
+        wet = np.ones(len(index), bool) if film is None else film.wets(corners)
+        return cls(1 / cos_m**2 - 1, cos_i.numpy(), gain, cos_o, photo.least[index], seen_mm2 / cos_o, wet)
 
     def __getitem__(self, index: np.ndarray) -> _Places:
         return _Places(*(value[index] for value in vars(self).values()))
@@ -275,14 +279,14 @@ class _Found:
     def _of_photo(cls, model: Model, wet: FoundFilm, views: Views, row: int) -> _Found:
         photo = _Photo.of(model, views, row, wet)
         index, area_px = photo.sparkles()
-        at = _Places.of(model, photo, index)
+        at = _Places.of(model, photo, index, wet.apart)
         flat = at.flat
         index, area_px, at = index[flat], area_px[flat], at[flat]
         samples = photo.samples[torch.from_numpy(index)]
         peak = np.maximum(photo.excess.flat[samples.pixel.numpy()], photo.least[index])
         count = min(PLACES, len(photo.samples))
         places = np.random.default_rng(row).choice(len(photo.samples), count, replace=False)
-        everywhere = _Places.of(model, photo, places)
+        everywhere = _Places.of(model, photo, places, wet.apart)
         everywhere = everywhere[everywhere.flat & photo.dry[places]]
         area_mm2 = everywhere.area_mm2 * (len(photo.samples) / max(1, count))
         everywhere = replace(everywhere, area_mm2=area_mm2)
@@ -292,42 +296,52 @@ class _Found:
         return cls(at, everywhere, peak, clipped, area_px, turn, after)
 
     def measured(self, height: int) -> tuple[Sparkle, float]:
-        """The sparkles of photos ``height`` px high, and the log-likelihood by which facets about the normals
-        of the surface explain them better than facets that face anywhere."""
-        start = np.log(START)
+        """The sparkles of photos ``height`` px high, and the log-likelihood by which facets on the film, and
+        about the normals of the surface, explain them better than facets anywhere that face anywhere."""
+        bounds = {each.name: (each.low, each.high) for each in Sparkle.parameters()}
+
+        def unpacked(log: np.ndarray) -> tuple[float, float]:
+            spread, coefficient = np.exp(np.clip(log, -20, 20))
+            return float(np.clip(spread, *np.square(bounds["spread"]))), float(coefficient)
+
         even = minimize(
-            lambda b: self._cost(START[0], math.exp(b[0]), _evenly)[0], start[1:], method="Nelder-Mead"
+            lambda log: self._cost(START[0], math.exp(log[0]), _evenly, 1)[0],
+            np.log(START[1:]),
+            method="Nelder-Mead",
         )
         best = minimize(
-            lambda ab: self._cost(*np.exp(ab.clip(-20, 20)), _ggx_slopes)[0], start, method="Nelder-Mead"
+            lambda log: self._cost(*unpacked(log), _ggx_slopes, 2)[0], np.log(START), method="Nelder-Mead"
         )
-        spread, coefficient = np.exp(best.x.clip(-20, 20))
-        shining = self._cost(spread, coefficient, _ggx_slopes)[1]
+        spread, coefficient = unpacked(best.x)
+        shining, dry = self._cost(spread, coefficient, _ggx_slopes, 2)[1]
         sigma2_px = self.area_px.sum() / np.log(self.peak / self.at.least).sum() / (2 * math.pi)
         width = self._width(spread, coefficient)
         values = {
             "weight": coefficient * shining * 2 * math.pi * sigma2_px,
             "density": shining / (math.pi * width**2),
+            "dry": dry / max(shining, 1e-30),
             "spread": math.sqrt(spread),
             "roughness": math.sqrt(width),
             "size": math.sqrt(sigma2_px) / height,
         }
-        bounds = {each.name: (each.low, each.high) for each in Sparkle.parameters()}
-        return Sparkle(**{name: float(np.clip(value, *bounds[name])) for name, value in values.items()}), (
-            even.fun - best.fun
-        )
+        bounded = {name: float(np.clip(value, *bounds[name])) for name, value in values.items()}
+        return Sparkle(**bounded), float(even.fun - best.fun)
 
-    def _cost(self, spread: float, coefficient: float, slopes: Slopes) -> tuple[float, float]:
+    def _cost(
+        self, spread: float, coefficient: float, slopes: Slopes, parts: int
+    ) -> tuple[float, np.ndarray]:
         """Negative log-likelihood of facets whose slopes lie so and whose mean peaks have that coefficient;
-        and the ρπα² for which it is least."""
+        and the ρπα² of each of the ``parts`` of the surface, 2: film and elsewhere, for which it is least."""
         peak = self.all.mean_peak(spread, coefficient)
         rate = (slopes(self.all.slope2, spread) * exp1(self.all.least[:, None] / peak)).sum(axis=1)
-        expected = max(float((self.all.area_mm2 * rate).sum()), 1e-30)
+        dry, dry_at = ((parts - 1) * ~each.wet for each in (self.all, self.at))
+        expected = np.bincount(dry, self.all.area_mm2 * rate, parts).clip(1e-30)
+        count = np.bincount(dry_at, minlength=parts)
         mean, mark = self.at.mean_peak(spread, coefficient), self.peak[:, None]
         density = np.where(self.clipped[:, None], exp1(mark / mean), np.exp(-mark / mean) / mark)
         density = (slopes(self.at.slope2, spread) * density).sum(axis=1)
-        log = np.log(np.maximum(density, 1e-300)).sum()
-        return len(self) * math.log(expected) - float(log), len(self) / expected
+        log = np.log(np.maximum(density, 1e-300)).sum() + xlogy(count, count / expected).sum()
+        return -float(log), count / expected
 
     def _width(self, spread: float, coefficient: float) -> float:
         """α of a facet's lobe, by which sparkles are still seen in the next photo.

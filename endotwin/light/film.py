@@ -44,6 +44,10 @@ class Film:
         everywhere[self.vertex] = values
         return everywhere
 
+    def wets(self, triangles: np.ndarray) -> np.ndarray:
+        """Bool [F], which of ``triangles`` [F, 3] have a corner that it lies on."""
+        return np.isin(triangles, self.vertex).any(axis=1)
+
 
 def mirrored(strength: Tensor, sin2: Tensor, roughness: float) -> Tensor:
     """Radiance that a film of weight 1 sends to the camera, of the shape of ``strength`` and ``sin2``.

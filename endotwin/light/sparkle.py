@@ -15,7 +15,6 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import poisson
 
 from endotwin.surface.vectors import dot, unit
 
@@ -89,21 +88,23 @@ def facets_about(
             half vector at the corners, not finite where there is none. density: facets a mm². spread: α of
             all facets together. width: α of each one's own lobe.
     """
-    cells, reach = max(1, int(spread / (REACH * width))), REACH * width / spread
+    cells, reach = _cells(density * area_mm2), REACH * width / spread
     lit = np.flatnonzero(np.isfinite(slopes).all(axis=(1, 2)))
     disk = slopes[lit] / np.sqrt(spread**2 + (slopes[lit] ** 2).sum(axis=-1, keepdims=True))
     ends = np.stack([disk.min(axis=1) - reach, disk.max(axis=1) + reach])
-    low, high = np.clip(np.floor((ends + 1) / 2 * cells), 0, cells - 1).astype(np.int64)
+    across = cells[lit, None]
+    low, high = np.clip(np.floor((ends + 1) / 2 * across), 0, across - 1).astype(np.int64)
     size = high - low + 1
     box, within = _repeated(size.prod(axis=1))
     row = lit[box]
     cell = low[box] + np.stack(np.divmod(within, size[box, 1]), axis=1)
     key = _hashed(name[row], cell[:, 0], cell[:, 1])
-    mean = density * area_mm2[row] * (2 / cells) ** 2 / math.pi
+    edge = 2 / cells[row, None]
+    mean = density * area_mm2[row] * edge[:, 0] ** 2 / math.pi
     at, which = _repeated(_drawn(_uniform(_hashed(key, 0)), mean))
     key = _hashed(key[at], 1 + which)
     u = [_uniform(_hashed(key, each)) for each in range(5)]
-    place = (cell[at] + np.stack(u[:2], axis=1)) * (2 / cells) - 1
+    place = (cell[at] + np.stack(u[:2], axis=1)) * edge[at] - 1
     radius2 = (place**2).sum(axis=1, keepdims=True)
     inside = radius2[:, 0] < 1
     root = np.sqrt(u[2])
@@ -115,6 +116,18 @@ def facets_about(
     return Facets(row[at], *(each.astype(np.float32) for each in found))[inside]
 
 
+def bare(name: np.ndarray, expected: np.ndarray) -> np.ndarray:
+    """Bool [F]: triangles of so many ``expected`` facets [F] that have none at all, whatever the view; only
+    those that expect a few are told."""
+    empty = _uniform(_hashed(_hashed(name, 0, 0), 0)) < np.exp(-expected * 4 / math.pi)
+    return empty & (_cells(expected) == 1)
+
+
+def _cells(expected: np.ndarray) -> np.ndarray:
+    """Cells across the disk of triangles of so many ``expected`` facets, int [F]: a cell has about one."""
+    return np.maximum(np.sqrt(expected), 1).astype(np.int64)
+
+
 def _repeated(count: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Row [N] and number within it [N] of ``count`` [R] things in each row."""
     row = np.repeat(np.arange(len(count)), count)
@@ -122,10 +135,16 @@ def _repeated(count: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _drawn(u: np.ndarray, mean: np.ndarray) -> np.ndarray:
-    """Poisson numbers [N] of ``mean`` [N] by inversion of ``u`` [N] in [0, 1)."""
-    some = u >= np.exp(-mean)
-    count = np.zeros(len(u), np.int64)
-    count[some] = poisson.ppf(u[some], mean[some])
+    """Poisson numbers [N] of ``mean`` [N], a few at most, by inversion of ``u`` [N] in [0, 1)."""
+    count, chance = np.zeros(len(u), np.int64), np.exp(-mean)
+    more = np.flatnonzero(u >= chance)
+    left, chance, mean = u[more] - chance[more], chance[more], mean[more]
+    while len(more):
+        count[more] += 1
+        chance = chance * mean / count[more]
+        left = left - chance
+        still = (left >= 0) & (chance > 0)
+        more, left, chance, mean = more[still], left[still], chance[still], mean[still]
     return count
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -13,9 +13,10 @@ from endotwin.cameras.base import Camera, solid_angle
 from endotwin.light import shading
 from endotwin.light.film import mirrors
 from endotwin.light.guides import AT_LENS, visible_from
-from endotwin.light.sparkle import REACH, Facets, Facing, facets_about, lobe
+from endotwin.light.sparkle import REACH, Facets, Facing, bare, facets_about, lobe
 from endotwin.render.illumination import ViewLight, log_light
 from endotwin.surface.vectors import dot, unit
+from endotwin.twin import Twin
 
 CHUNK = 1 << 16
 """Triangles whose facets are made at once: memory stays flat."""
@@ -36,13 +37,32 @@ PIXELS = 1 << 22
 """Of spots that are drawn at once."""
 
 
-def sparkles(light: ViewLight, camera: Camera, distance_mm: np.ndarray) -> np.ndarray:
+def rough_mm2(twin: Twin) -> np.ndarray | None:
+    """Area of each triangle on which facets lie, as far as they lie there, float64 [F]; 0 where the triangle
+    has none at all. None: there are no sparkles."""
+    if (effect := twin.effects.get("sparkle")) is None:
+        return None
+    triangles, film = twin.surface.triangles, twin.film
+    first, second = (
+        twin.surface.vertices_mm[triangles[:, k]] - twin.surface.vertices_mm[triangles[:, 0]] for k in (1, 2)
+    )
+    area_mm2 = np.linalg.norm(np.cross(first, second), axis=1).astype(np.float64) / 2
+    if film is not None:
+        area_mm2 *= np.where(film.wets(triangles), 1, effect.dry)
+    area_mm2[bare(np.arange(len(triangles)), effect.density * area_mm2)] = 0
+    return area_mm2
+
+
+def sparkles(light: ViewLight, rough_mm2: np.ndarray, camera: Camera, distance_mm: np.ndarray) -> np.ndarray:
     """What sparkles add to the radiance of the view from ``light.T_local_camera`` through ``camera``, whose
-    pixels see a surface at ``distance_mm`` [H, W] (0: none), float32 [H, W]."""
+    pixels see a surface at ``distance_mm`` [H, W] (0: none), float32 [H, W].
+
+    ``rough_mm2`` [F] is that of the surface at rest: tissue that is stretched has no other facets.
+    """
     added, shape = np.zeros(distance_mm.size), distance_mm.shape
     sigma_px = max(LEAST_PX, light.twin.effects["sparkle"].size * shape[0])
     at_once = max(1, int(PIXELS / (2 * SPOT * sigma_px + 2) ** 2))
-    for points_mm, flux in _shining(_Scene.of(light, camera, float(distance_mm.max(initial=0)))):
+    for points_mm, flux in _shining(_Scene.of(light, rough_mm2, camera, float(distance_mm.max(initial=0)))):
         spots = _Spots.of(points_mm, flux, camera, distance_mm, sigma_px)
         for start in range(0, len(spots.flux), at_once):
             added += spots[start : start + at_once].drawn(shape)
@@ -54,30 +74,27 @@ class _Scene:
     """A surface in the camera's frame, and the light on it.
 
     Attributes:
-        points_mm, normals: float32 [V, 3]. half: [V, K, 3], half vectors to the guides; triangles: int [F],
-            those that the camera may see. light: of the view.
+        points_mm, normals: float32 [V, 3]. triangles: int [F], those with facets that the camera may see.
+            rough_mm2: [F], of each. light: of the view.
     """
 
     points_mm: np.ndarray
     normals: np.ndarray
-    half: np.ndarray
     triangles: np.ndarray
+    rough_mm2: np.ndarray
     light: ViewLight
 
     @classmethod
-    def of(cls, light: ViewLight, camera: Camera, farthest_mm: float) -> _Scene:
+    def of(cls, light: ViewLight, rough_mm2: np.ndarray, camera: Camera, farthest_mm: float) -> _Scene:
         surface, pose = light.twin.surface, light.T_local_camera
         rotation = pose[:3, :3].astype(np.float32)
         points_mm = ((surface.vertices_mm - pose[:3, 3]) @ pose[:3, :3]).astype(np.float32)
         distance_mm = np.sqrt(dot(points_mm, points_mm))
         steepest = np.nanmin(camera.pixel_directions[..., 2])
         seen = (points_mm[:, 2] >= steepest * distance_mm) & (distance_mm <= (1 + HIDDEN) * farthest_mm)
-        scene = cls(points_mm, surface.normals @ rotation, None, None, light)
-        return replace(
-            scene,
-            half=scene.mirrors(points_mm)[0],
-            triangles=np.flatnonzero(seen[surface.triangles].any(axis=1)),
-        )
+        chosen = np.flatnonzero(rough_mm2)
+        chosen = chosen[seen[surface.triangles[chosen]].any(axis=1)]
+        return cls(points_mm, surface.normals @ rotation, chosen, rough_mm2[chosen], light)
 
     @property
     def guides_mm(self) -> np.ndarray:
@@ -99,10 +116,10 @@ def _shining(scene: _Scene) -> Iterator[tuple[np.ndarray, np.ndarray]]:
         name = scene.triangles[start : start + CHUNK]
         corners = surface.triangles[name]
         facing = Facing.of(scene.points_mm, scene.normals, corners)
-        edges = scene.points_mm[corners[:, 1:]] - scene.points_mm[corners[:, :1]]
-        area_mm2 = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1) / 2
-        for guide in range(scene.half.shape[1]):
-            slopes = facing.slope(scene.half[corners, guide])
+        half = scene.mirrors(scene.points_mm[corners].reshape(-1, 3))[0].reshape(len(corners), 3, -1, 3)
+        area_mm2 = scene.rough_mm2[start : start + CHUNK]
+        for guide in range(half.shape[2]):
+            slopes = facing.slope(half[:, :, guide])
             facets = facets_about(name, area_mm2, slopes, effect.density, spread, width)
             points_mm = np.einsum("nk,nka->na", facets.barycentric, scene.points_mm[corners[facets.row]])
             yield _mirrored(scene, facing[facets.row], facets, points_mm, guide)
