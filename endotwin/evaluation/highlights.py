@@ -71,9 +71,11 @@ def _share(found: np.ndarray, of: np.ndarray) -> float:
     return float(found[of].mean()) if of.any() else float("nan")
 
 
+def log_areas(mask: np.ndarray) -> np.ndarray:
+    """log₂ of the area, px, of each of the highlights of ``mask`` [H, W]."""
+    return np.log2(cv2.connectedComponentsWithStats(mask.view(np.uint8))[2][1:, cv2.CC_STAT_AREA])
+
+
 def _size_distance(one: np.ndarray, other: np.ndarray) -> float:
-    sizes = [
-        np.log2(cv2.connectedComponentsWithStats(mask.view(np.uint8))[2][1:, cv2.CC_STAT_AREA])
-        for mask in (one, other)
-    ]
+    sizes = [log_areas(mask) for mask in (one, other)]
     return float(wasserstein_distance(*sizes)) if all(len(each) for each in sizes) else float("nan")
