@@ -1,6 +1,6 @@
-"""Highlights of held-out photos, of a twin without its sparkles and of the twin with them: how many of which size.
+"""Highlights of held-out photos, of a twin without its sparkles, and with them: how many of which size.
 
-    python benchmarks/sparkles.py TWIN
+python benchmarks/sparkles.py TWIN
 """
 
 from __future__ import annotations
@@ -43,8 +43,9 @@ def main() -> None:
     for name, each in areas.items():
         count = np.histogram(np.concatenate(each), np.arange(13))[0]
         off = np.mean([wasserstein_distance(*pair) for pair in zip(areas["photo"], each, strict=True)])
+        row = f"{count.sum() / len(each):.0f} | {' '.join(map(str, count))} | {off:.2f}"
         shown = f"{np.mean(quality[name]):.2f} dB" if name in quality else ""
-        print(f"| {name} | {count.sum() / len(each):.0f} | {' '.join(map(str, count))} | {off:.2f} | {shown} |")
+        print(f"| {name} | {row} | {shown} |")
 
 
 if __name__ == "__main__":
