@@ -14,13 +14,16 @@ from endotwin.cameras.base import solid_angle
 from endotwin.config import STANDARD
 from endotwin.effects import Decision, Effects
 from endotwin.effects.coat import Coat
+from endotwin.effects.film import Film as FilmEffect
 from endotwin.effects.offset import Offset
 from endotwin.effects.shadows import Shadows
 from endotwin.effects.sparkle import Sparkle
 from endotwin.effects.specular import Specular
+from endotwin.evaluation import evaluate
 from endotwin.fit.film import Found, Model
 from endotwin.fit.lighting import Relighting
 from endotwin.fit.sparkle import sparkle
+from endotwin.light.film import Film
 from endotwin.light.sparkle import REACH, facets_about
 from endotwin.pixels.pace import Pace
 from endotwin.pixels.samples import gather
@@ -114,6 +117,25 @@ def test_a_sparkle_stays_on_the_tissue_while_the_camera_moves_and_another_shines
     assert len(kept["near"]) > 30
     assert np.mean(np.abs(kept["near"] - 1) < 0.35) > 0.85
     assert np.median(kept["far"]) < 0.1
+
+
+def test_sparkles_lie_on_the_film_and_only_as_many_elsewhere_as_dry_tissue_has(bare):
+    vertex = np.arange(len(bare.surface.vertices_mm) // 2, dtype=np.int32)
+    film = Film(vertex, bare.surface.normals[vertex], np.zeros(len(vertex), np.float32))
+    wet = replace(bare, materials=replace(bare.materials, film=film))
+    on_film = film.wets(bare.surface.triangles)
+    for dry in (0.0, 0.25):
+        effects = Effects([FilmEffect(), Sparkle(density=200.0, dry=dry)])
+        rough_mm2, whole_mm2 = (sparkles.rough_mm2(replace(each, effects=effects)) for each in (wet, bare))
+        np.testing.assert_allclose(rough_mm2[on_film], whole_mm2[on_film])
+        assert rough_mm2[~on_film].sum() == pytest.approx(dry * whole_mm2[~on_film].sum(), rel=1e-3)
+    assert sparkles.rough_mm2(bare) is None
+
+
+def test_a_score_is_that_of_the_twin_without_its_sparkles(tmp_path):
+    twin = recorded(tmp_path / "smooth")
+    glittering = replace(twin, effects=twin.effects.including(Sparkle(weight=3.0)))
+    assert evaluate(glittering).psnr == evaluate(twin).psnr
 
 
 def test_facets_lie_evenly_and_face_as_ggx_has_it():

@@ -23,7 +23,7 @@ class Sparkle(Effect):
     """
 
     name: ClassVar[str] = "sparkle"
-    weight: float = parameter(0.1, 0.0, 50.0)
+    weight: float = parameter(0.05, 0.0, 50.0)
     density: float = parameter(30.0, 1e-3, 1e4)
     dry: float = parameter(0.05, 0.0, 1.0)
     spread: float = parameter(0.6, 0.1, 1.0)
