@@ -26,7 +26,7 @@ from endotwin.fit.sparkle import sparkle
 from endotwin.light.film import Film
 from endotwin.light.sparkle import REACH, facets_about
 from endotwin.pixels.pace import Pace
-from endotwin.pixels.samples import gather
+from endotwin.pixels.samples import Views, gather
 from endotwin.render import Renderer, sparkles
 from endotwin.surface.casting import Caster
 
@@ -209,3 +209,9 @@ def test_photos_without_sparkles_tell_of_none(tmp_path):
     twin = recorded(tmp_path / "smooth")
     assert measured(twin, "on")[0].weight == 0
     assert measured(twin, "auto")[0] is None and measured(twin, "off")[0] is None
+
+
+def test_two_photos_are_too_few_to_tell():
+    views = Views(CAMERA, np.ones((144, 192), bool), np.arange(2), np.stack([POSE, POSE]))
+    found, decision = sparkle(None, Found(Decision("on", "")), views, "on", lambda *_: None)
+    assert found is None and decision.state == "off" and "too few photos" in decision.reason

@@ -3,8 +3,8 @@
 They are counted in photos from which no film was found, beside a film from the others. Facets that shine are
 a marked Poisson process: where the half vector has the slope s, ρ·P(s)·πα² of them a mm² are within their own
 lobe's width α of it, and of those whose mean peak is B̄ the share E₁(T/B̄) outshines T (a Gaussian lobe of an
-exponential size). Its likelihood tells the density ρ, the spread of P and B̄; how soon a sparkle fades from
-one photo to the next tells α.
+exponential size). Its likelihood tells ρ on the film and elsewhere, the spread of P, and B̄; which sparkles
+the next photo still shows tells α.
 """
 
 from __future__ import annotations
@@ -77,6 +77,8 @@ def sparkle(
         return None, Decision("off", "forced off")
     if wet.film is None and wanted == "auto":
         return None, Decision("off", "no film of fluid, whose facets they are")
+    if len(views.frames) <= APART // 2:
+        return None, Decision("off", "too few photos to keep some apart")
     began = time.perf_counter()
     found = _Found.of(model, wet, views, report)
     told = len(found) >= LEAST
