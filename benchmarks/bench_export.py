@@ -15,6 +15,7 @@ import subprocess
 import tempfile
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -61,6 +62,7 @@ def main() -> None:
     parser.add_argument("--poses", type=int, default=3)
     arguments = parser.parse_args()
     twin = Twin.load(arguments.twin)
+    twin = replace(twin, effects=twin.effects.without(["sparkle"]))
     poses = twin.sequence().T_world_camera
     heldout = twin.source.heldout(len(poses))
     frames = [heldout[i] for i in np.linspace(0, len(heldout) - 1, arguments.poses).astype(int)]

@@ -30,6 +30,13 @@ def test_bright_tissue_larger_than_any_highlight_and_faint_spots_are_none():
     assert not highlights(picture((160, 120, 3), white=0.08), WHOLE).any()
 
 
+def test_tissue_between_two_holes_is_none_and_a_highlight_there_is_one():
+    valid = WHOLE.copy()
+    valid[60:180, 100:140] = valid[60:180, 150:190] = False
+    assert not highlights(picture(), valid).any()
+    assert highlights(picture((145, 120, 2)), valid)[120, 145]
+
+
 def test_a_red_vein_or_spot_is_none():
     red = picture()
     red[100:104, 50:250, 0] += 0.3

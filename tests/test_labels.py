@@ -14,6 +14,7 @@ from endotwin.cameras import Camera
 from endotwin.effects import Effects
 from endotwin.effects.coat import Coat
 from endotwin.effects.film import Film as FilmEffect
+from endotwin.effects.sparkle import Sparkle
 from endotwin.effects.specular import Specular
 from endotwin.errors import OptionError
 from endotwin.light.film import Film
@@ -191,11 +192,11 @@ def test_diffuse_and_specular_add_up_to_the_radiance(folded):
     assert shine.min() >= -1e-6 and shine.max() > 0.02
 
 
-def test_highlights_are_where_coat_and_film_shine_and_diffuse_has_neither(folded):
+def test_highlights_are_where_coat_film_and_sparkles_shine_and_diffuse_has_none(folded):
     twin, poses = folded
     vertex = np.arange(0, len(twin.surface.vertices_mm), 7, dtype=np.int32)
     film = Film(vertex, twin.surface.normals[vertex], np.ones(len(vertex), np.float32))
-    effects = Effects([Specular(), Coat(0.8, 0.15), FilmEffect(roughness=0.1)])
+    effects = Effects([Specular(), Coat(0.8, 0.15), FilmEffect(roughness=0.1), Sparkle(1.0)])
     wet = replace(twin, materials=replace(twin.materials, film=film), effects=effects)
     images, dry = (labelled(t, poses, t.camera).frame(1) for t in (wet, twin))
     np.testing.assert_array_equal(images["diffuse"], dry["diffuse"])

@@ -60,6 +60,14 @@ class Camera(ABC):
         return {"model": self.model, **dataclasses.asdict(self)}
 
 
+def solid_angle(camera: Camera, uv: np.ndarray) -> np.ndarray:
+    """Solid angle, sr, of the pixels about ``uv`` [N, 2], [N]: the cross product of the steps that their rays
+    take across and down."""
+    step = np.array([[-0.5, 0], [0.5, 0], [0, -0.5], [0, 0.5]])
+    left, right, above, below = np.moveaxis(camera.directions(uv[:, None] + step), 1, 0)
+    return np.linalg.norm(np.cross(right - left, below - above), axis=1)
+
+
 def scaled_size(camera: Camera, scale: float) -> tuple[int, int, float, float]:
     """Width and height at ``scale``, rounded to pixels, and the ratios per axis that the rounding leaves.
 

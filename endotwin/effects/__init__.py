@@ -13,7 +13,10 @@ from importlib import import_module
 from endotwin.effects.effect import STATES, Decision, Effect
 from endotwin.errors import OptionError
 
-FITTED = ("specular", "offset", "shadows", "interreflection", "gain", "vignetting", "profile", "coat", "film")
+FITTED = (
+    *("specular", "offset", "shadows", "interreflection", "gain", "vignetting", "profile"),
+    *("coat", "film", "sparkle"),
+)
 RENDERED = (
     *("auto_gain", "noise", "motion_blur", "defocus", "rolling_shutter", "interlacing", "chromatic"),
     *("bloom", "lens", "processor", "overlay", "codec", "video"),

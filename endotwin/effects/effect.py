@@ -4,7 +4,7 @@ An effect is a frozen dataclass whose fields are its parameters, in a module of 
 on its way in this order:
 
 - where it comes from and how it falls (offset, profile, shadows, interreflection);
-- how tissue answers it (specular, coat);
+- how tissue answers it (specular, coat, film, sparkle);
 - when pixels see it (motion blur, rolling shutter, interlacing);
 - what the lens makes of the radiance image (vignetting, defocus, chromatic, bloom, lens);
 - what the sensor makes of that (gain, auto_gain, noise);

@@ -260,6 +260,7 @@ def _compared(
 
 
 def _shown_by_twin(twin: Twin, sequence: Sequence) -> Show:
+    twin = replace(twin, effects=twin.effects.without(["sparkle"]))
     renderer = Renderer(twin, sequence.camera)
 
     def show(frame: Frame, photo: np.ndarray, valid: np.ndarray) -> tuple[np.ndarray, float, np.ndarray]:

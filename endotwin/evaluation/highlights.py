@@ -54,11 +54,12 @@ def highlights(picture: np.ndarray, valid: np.ndarray) -> np.ndarray:
     """Bool [H, W]: pixels, among the ``valid`` [H, W], that outshine what surrounds them in green and blue.
 
     The white top-hat (Serra 1982): what is left of a picture after its opening by a disk. Light that is
-    mirrored is white; of what tissue scatters, red is most.
+    mirrored is white; of what tissue scatters, red is most. Pixels that are not valid count as bright: were
+    they dark, every strip of tissue between two holes would outshine its surroundings.
     """
     size = 2 * round(SURROUNDINGS * picture.shape[1] / 2) + 1
     disk = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
-    bluish = np.where(valid, picture[..., 1:].min(axis=2), 0).astype(np.float32)
+    bluish = np.where(valid, picture[..., 1:].min(axis=2), 1).astype(np.float32)
     return valid & (cv2.morphologyEx(bluish, cv2.MORPH_TOPHAT, disk) > OUTSHINES)
 
 
@@ -71,9 +72,11 @@ def _share(found: np.ndarray, of: np.ndarray) -> float:
     return float(found[of].mean()) if of.any() else float("nan")
 
 
+def log_areas(mask: np.ndarray) -> np.ndarray:
+    """log₂ of the area, px, of each of the highlights of ``mask`` [H, W]."""
+    return np.log2(cv2.connectedComponentsWithStats(mask.view(np.uint8))[2][1:, cv2.CC_STAT_AREA])
+
+
 def _size_distance(one: np.ndarray, other: np.ndarray) -> float:
-    sizes = [
-        np.log2(cv2.connectedComponentsWithStats(mask.view(np.uint8))[2][1:, cv2.CC_STAT_AREA])
-        for mask in (one, other)
-    ]
+    sizes = [log_areas(mask) for mask in (one, other)]
     return float(wasserstein_distance(*sizes)) if all(len(each) for each in sizes) else float("nan")

@@ -73,6 +73,20 @@ Report = Callable[[str, int, int], None]
 
 
 @dataclass(frozen=True)
+class Found:
+    """Whether there is a film, and why.
+
+    Attributes:
+        film, effect: None without one. apart: the film from those photos alone that are not kept apart.
+    """
+
+    decision: Decision
+    film: Film | None = None
+    effect: FilmEffect | None = None
+    apart: Film | None = None
+
+
+@dataclass(frozen=True)
 class Model:
     """All that was fitted before the film."""
 
@@ -81,12 +95,10 @@ class Model:
     relighting: Relighting
     caster: Caster
 
-    def film(
-        self, samples: Samples, wanted: str, report: Report
-    ) -> tuple[Film | None, FilmEffect | None, Decision]:
+    def film(self, samples: Samples, wanted: str, report: Report) -> Found:
         """The film that the photos call for, or that is ``wanted`` (auto, on or off); and why."""
         if wanted == "off":
-            return None, None, Decision("off", "forced off")
+            return Found(Decision("off", "forced off"))
         began = time.perf_counter()
 
         def decided(state: str, reason: str, gain_db: float) -> Decision:
@@ -95,7 +107,7 @@ class Model:
         judges = self.based(samples.thinned(JUDGES, np.random.default_rng(0)))
         most_db = judges.most_db()
         if not judges.shines.any() or (wanted == "auto" and most_db < LEAST_DB):
-            return None, None, decided("off", f"glints beyond the model cost {most_db:.2f} dB", most_db)
+            return Found(decided("off", f"glints beyond the model cost {most_db:.2f} dB", most_db))
         shown = self.based(self._about(judges, report))
         glints = _Glints.of(shown, shown.vertices())
         ours = glints[glints.row % APART != APART // 2]
@@ -105,12 +117,13 @@ class Model:
         best = next(k for k, each in enumerate(gains_db) if each >= max(gains_db) - LEAST_DB)
         gain_db, roughness = gains_db[best], ROUGHNESSES[best]
         if wanted == "auto" and gain_db < LEAST_DB:
-            return None, None, decided("off", "does not predict the glints of other photos", gain_db)
+            return Found(decided("off", "does not predict the glints of other photos", gain_db))
         film = glints.fitted(roughness).film(glints)
         reason = f"predicts glints of other photos, on {len(film):,} vertices ({gain_db:+.2f} dB)"
         if wanted == "on":
             reason = f"forced on; {reason}"
-        return film, FilmEffect(roughness=roughness), decided("on", reason, gain_db)
+        effect = FilmEffect(roughness=roughness)
+        return Found(decided("on", reason, gain_db), film, effect, trials[best].film(ours))
 
     def based(self, samples: Samples) -> Based:
         """``samples``, which the guides light, with what the model shows there."""

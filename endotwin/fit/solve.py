@@ -20,7 +20,7 @@ from endotwin.errors import SequenceError
 from endotwin.evidence.coat import judged as judged_coat
 from endotwin.evidence.decide import decide
 from endotwin.evidence.glints import Glints
-from endotwin.fit.film import Model
+from endotwin.fit.film import Found, Model
 from endotwin.fit.gauss_newton import (
     CPU,
     GaussNewton,
@@ -33,6 +33,7 @@ from endotwin.fit.gauss_newton import (
 from endotwin.fit.hashgrid import HashGrid, HashOperator
 from endotwin.fit.lighting import Relighting, lit
 from endotwin.fit.model import Globals, at_pixels
+from endotwin.fit.sparkle import sparkle
 from endotwin.fit.tilt import Tilter
 from endotwin.fit.unexplained import residual_warning
 from endotwin.fit.within import Within
@@ -168,9 +169,14 @@ def fit_twin(
         twin = replace(twin, surface=replace(surface, normals=normals))
     with stopwatch.stage("film"):
         wanted = states.get("film", "auto") if "specular" in decided.effects else "off"
-        film, wet, judged = None, None, Decision("off", "no time to judge")
+        wet, model = Found(Decision("off", "no time to judge")), Model(twin, state, relighting, caster)
         if not pace.out_of_time():
-            film, wet, judged = Model(twin, state, relighting, caster).film(samples, wanted, pace.report)
+            wet = model.film(samples, wanted, pace.report)
+    with stopwatch.stage("sparkle"):
+        wanted = states.get("sparkle", "auto") if "specular" in decided.effects else "off"
+        glitter, counted = None, Decision("off", "no time to judge")
+        if not pace.out_of_time():
+            glitter, counted = sparkle(model, wet, samples.views, wanted, pace.report)
     odd = unusual(state.shared)
     if odd:
         logger.warning(
@@ -179,13 +185,15 @@ def fit_twin(
             *(" and ".join(odd), twin.source.path),
         )
     with stopwatch.stage("price"):
-        decisions = {**decided.decisions, "coat": coat, "film": judged}
+        decisions = {**decided.decisions, "coat": coat, "film": wet.decision, "sparkle": counted}
         if "interreflection" in decided.effects and not relighting.bounces:
             decisions["interreflection"] = _without_bounce(decisions["interreflection"])
         if left is not None and (said := residual_warning(left, twin.sequence(), decisions)):
             logger.warning("%s; 'endotwin check %s' looks for the cause", said, twin.source.path)
-        effects = relighting.effects if wet is None else relighting.effects.including(wet)
-        fitted = price(_fitted(twin, state, effects, decisions, film), caster, samples.views)
+        effects = relighting.effects
+        for effect in filter(None, (wet.effect, glitter)):
+            effects = effects.including(effect)
+        fitted = price(_fitted(twin, state, effects, decisions, wet.film), caster, samples.views)
     return fitted.with_record(
         fit={"method": "twin", "undetermined": list(start.undetermined), **stopwatch.to_dict()}
     )
@@ -370,6 +378,8 @@ def _fitted(
     light, coat = state.shared.light, state.shared.coat
     if coat is not None:
         effects = effects.including(replace(coat, weight=coat.weight * scale))
+    if (glitter := effects.get("sparkle")) is not None:
+        effects = effects.including(replace(glitter, weight=glitter.weight * scale))
     return replace(
         twin,
         materials=Materials(

@@ -44,6 +44,10 @@ class Film:
         everywhere[self.vertex] = values
         return everywhere
 
+    def wets(self, triangles: np.ndarray) -> np.ndarray:
+        """Bool [F], which of ``triangles`` [F, 3] have a corner that it lies on."""
+        return np.isin(triangles, self.vertex).any(axis=1)
+
 
 def mirrored(strength: Tensor, sin2: Tensor, roughness: float) -> Tensor:
     """Radiance that a film of weight 1 sends to the camera, of the shape of ``strength`` and ``sin2``.
@@ -99,3 +103,23 @@ def mirrors_in_view(
     visible = None if caster is None else visible_from(caster, T_local_camera, seen_mm, guides_mm)
     half, strength = mirrors(seen_mm, guides_mm, profile, log_light, visible)
     return half @ rotation.T.astype(np.float32), strength
+
+
+def film_in_view(
+    film: Film,
+    roughness: float,
+    vertices_mm: np.ndarray,
+    T_local_camera: np.ndarray,
+    guides_mm: np.ndarray,
+    profile: float,
+    log_light: tuple[float, float, float],
+    caster: Caster | None,
+) -> np.ndarray:
+    """Radiance that ``film`` at each of ``vertices_mm`` [V, 3] sends to the camera, float32 [V]; the other
+    arguments are those of ``mirrors_in_view``."""
+    half, strength = mirrors_in_view(
+        vertices_mm[film.vertex], T_local_camera, guides_mm, profile, log_light, caster
+    )
+    across = np.cross(film.normal[:, None], half)
+    lobe = mirrored(strength, torch.from_numpy(dot(across, across)), roughness).sum(dim=1)
+    return film.on_all(film.weight * lobe.numpy(), len(vertices_mm))

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from endotwin.light import shading
 from endotwin.light.bounced import Albedo, BouncedLight, Places
-from endotwin.light.film import mirrored, mirrors_in_view
+from endotwin.light.film import film_in_view
 from endotwin.light.forward import Lit, Lobes, radiance
 from endotwin.light.guides import AT_LENS, COSINE, guided, log_axis, visible_from
 from endotwin.light.incidence import COS_MIN, incidence_on
@@ -70,18 +70,16 @@ class Illumination:
         twin, effects, film = self.twin, self.twin.effects, self.twin.film
         if film is None:
             return None
-        half, strength = mirrors_in_view(
-            twin.surface.vertices_mm[film.vertex],
+        return effects["film"].amount * film_in_view(
+            film,
+            effects["film"].roughness,
+            twin.surface.vertices_mm,
             T_local_camera,
             np.asarray(effects.guides_mm or AT_LENS, np.float32),
             effects.profile,
-            _log_light(twin),
+            log_light(twin),
             self._caster if "shadows" in effects else None,
         )
-        across = np.cross(film.normal[:, None], half)
-        lobe = mirrored(strength, torch.from_numpy(dot(across, across)), effects["film"].roughness).sum(dim=1)
-        radiance = effects["film"].amount * film.weight * lobe.numpy()
-        return film.on_all(radiance, len(twin.surface.vertices_mm))
 
     def _bounced(self, T_local_camera: np.ndarray) -> np.ndarray:
         """Indirect irradiance of the vertices, float32 [V, 3], with L0 = 1."""
@@ -145,13 +143,13 @@ class ViewLight:
             bounced = torch.from_numpy(hits.interpolate(twin.surface, self.irradiance))
             lit = replace(lit, irradiance=bounced, gloss=gloss)
         base_color = material[:, :3] * (1 - material[:, 4:])
-        x = radiance(lit, _log_light(twin), base_color, roughness, _lobes(twin))
+        x = radiance(lit, log_light(twin), base_color, roughness, _lobes(twin))
         if self.film is not None:
             x = x + torch.from_numpy(hits.interpolate(twin.surface, self.film))[:, None]
         return x
 
 
-def _log_light(twin: Twin) -> tuple[float, float, float]:
+def log_light(twin: Twin) -> tuple[float, float, float]:
     """ln L0, n and q."""
     return math.log(max(twin.light.L0, 1e-30)), twin.light.n, twin.light.q
 

@@ -19,6 +19,7 @@ from endotwin.light import shading
 from endotwin.light.forward import Lit
 from endotwin.light.incidence import to_camera
 from endotwin.render.illumination import Illumination, ViewLight
+from endotwin.render.sparkles import rough_mm2, sparkles
 from endotwin.run.threads import THREADS
 from endotwin.sequence.poses import as_poses
 from endotwin.surface.casting import Caster, Correspondences
@@ -134,6 +135,7 @@ class Renderer:
         self._illumination = Illumination(twin, self.caster)
         self._exposure = np.asarray(exposure, np.float32)
         self._material = _material(twin)
+        self._rough_mm2 = rough_mm2(twin)
 
     def edited(self, twin: Twin, exposure: Sequence[float] | float = 1.0) -> Renderer:
         """The renderer of another edit of the same twin; what the edits have in common is not made again."""
@@ -142,6 +144,7 @@ class Renderer:
         other._illumination = Illumination(twin, self.caster, before=self._illumination)
         if twin.materials is not self.twin.materials:
             other._material = _material(twin)
+        other._rough_mm2 = rough_mm2(twin)
         vars(other).pop("_transmission", None)
         return other
 
@@ -207,6 +210,9 @@ class Renderer:
         dark[met.edges] = ~radiance[met.edges].any(axis=1)
         told &= ~_alone(dark)
         _close_slits(radiance, told, met.edges)
+        if "sparkle" in self.twin.effects:
+            distance_mm = laid_out(met.centres.hits.distance_mm, met.centres.hits.pixel, shape)
+            radiance += sparkles(light, self._rough_mm2, self.camera, distance_mm)[..., None]
         radiance *= self._exposure * exposure
         if self._transmission is not None:
             radiance *= self._transmission

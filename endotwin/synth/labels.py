@@ -60,7 +60,7 @@ OF_POLYPS = ("polyp",)
 
 DEFAULT_LABELS = ("rgb", "depth", "normals", "mask")
 
-MIRRORS = ("coat", "film")
+MIRRORS = ("coat", "film", "sparkle")
 """Effects that reflect without scattering."""
 
 COLUMNS = {"base_color": slice(0, 3), "roughness": 3, "metallic": 4}

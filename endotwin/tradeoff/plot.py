@@ -45,6 +45,7 @@ KNOB_COLORS = (
     "#5f9ea0",
     "#c2679b",
     "#7a8b2f",
+    "#6c757d",
 )
 PRESET_COLOR, FRONT_COLOR, KNEE_COLOR = "#222222", "#bbbbbb", "#d1495b"
 STAGE_COLORS = {

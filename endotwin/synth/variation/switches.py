@@ -70,7 +70,7 @@ def equipped(twin: Twin, states: Mapping[str, str], trajectory: object) -> Twin:
     for name, state in states.items():
         if state != "on" or name in effects:
             continue
-        if name in FITTED and name != "coat":
+        if name in FITTED and name not in ("coat", "sparkle"):
             raise OptionError(f"the twin has no {name}; a fit with its effect {name} on finds it")
         if name in SUCCESSIVE and str(trajectory).startswith("jitter"):
             raise OptionError(f"{name} needs poses that follow each other, and those of jitter do not")
