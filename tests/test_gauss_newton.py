@@ -1,10 +1,25 @@
 """The least-squares solver's own promises; what it finds is tested in test_fit."""
 
+import math
 from dataclasses import replace
 
+import numpy as np
 import pytest
+import torch
 
-from endotwin.fit.gauss_newton import GLOBAL_RANGE, unusual
+from endotwin.fit.gauss_newton import (
+    BRIGHTEST,
+    DARKEST,
+    GLOBAL_RANGE,
+    State,
+    as_bouncing,
+    brightest,
+    rescaled,
+    room_below_furnace,
+    too_dark,
+    unusual,
+    without_furnace,
+)
 from endotwin.fit.model import Globals
 from endotwin.twin import Light, Response
 
@@ -35,3 +50,37 @@ def test_more_than_three_standard_deviations_from_the_prior_are_told():
     assert ended_at(0.1542, 2.0, 2.0) == ["γ 0.154 (usually 0.155 to 0.755)"]
     assert ended_at(0.4545, 6.0, 2.0) == ["n 6.000 (usually 0.000 to 5.300)"]
     assert ended_at(0.4545, 2.0, 0.3) == ["q 0.300 (usually 0.350 to 3.650)"]
+
+
+def colored(factor: float, log_scale: float) -> State:
+    """Tissue of a hundred albedos up to about ``factor``, as fitted beside a scale."""
+    shared = Globals.of(Light(10.0, 2.0, 2.0), Response(0.45), 0.04, bounce=True)
+    shown = (factor * torch.linspace(0.2, 1, 100)[:, None] * torch.tensor([1.0, 0.6, 0.5])) ** shared.gamma
+    return rescaled(State(None, torch.cat([shown, torch.zeros(100, 1)], dim=1), None, shared), log_scale)
+
+
+def bounced_off(state: State) -> np.ndarray:
+    """Mean albedo [3]."""
+    return state.materials[:, :3].mean(dim=0).numpy() * math.exp(state.shared.log_scale)
+
+
+@pytest.mark.parametrize("factor", [0.3, 0.8, 1.4])
+def test_light_bounces_after_a_step_as_the_step_took_it_to(factor):
+    before, after = colored(0.8, 0.0), colored(factor, 0.25)
+    wanted = bounced_off(rescaled(before, 0.25))
+    np.testing.assert_allclose(bounced_off(as_bouncing(after, before)), wanted, rtol=1e-5)
+
+
+@pytest.mark.parametrize("step", [-1.0, 0.05, 0.4, 3.0])
+def test_a_step_that_leaves_room_ends_below_the_furnace(step):
+    state = colored(0.8, 0.0)
+    share = room_below_furnace(state, step)
+    moved = rescaled(state, share * step)
+    assert 0 < share <= 1 and brightest(moved) * math.exp(moved.shared.log_scale) <= BRIGHTEST * (1 + 1e-6)
+    assert room_below_furnace(without_furnace(colored(0.8, 2.0)), 0.1) < 1e-6
+
+
+def test_tissue_is_too_dark_by_what_it_reflects_not_by_its_scale():
+    for factor in (0.2, 0.8, 1.6):
+        assert too_dark(colored(factor, math.log(0.9 * DARKEST / factor)))
+        assert not too_dark(colored(factor, math.log(1.2 * DARKEST / factor)))

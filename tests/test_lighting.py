@@ -13,7 +13,7 @@ from endotwin.effects.offset import Offset
 from endotwin.effects.shadows import Shadows
 from endotwin.effects.specular import Specular
 from endotwin.fit.gauss_newton import GaussNewton
-from endotwin.fit.lighting import Relighting, lit
+from endotwin.fit.lighting import Relighting, lit, settled
 from endotwin.fit.model import at_pixels
 from endotwin.fit.within import Within
 from endotwin.surface.casting import Caster
@@ -102,3 +102,29 @@ def test_guides_that_cast_shadows_stay_where_those_told():
     effects = Effects([Specular(), Offset(((2.0, -1.0, 0.0),)), Shadows()])
     samples = tube_twin.photographed(twin, tube_twin.CAMERA, tube_twin.pose(0.5)[None])
     assert Relighting(twin.surface, Caster(twin.surface), effects, samples.views).varied.guides == 0
+
+
+def tissue_under(bounced_off: np.ndarray, photo: np.ndarray) -> np.ndarray:
+    """Albedo that shows ``photo`` in a white sphere lit with 1, beside the light that bounces off albedo
+    ``bounced_off``: ρ + ρ² + … of it (Ulbricht's integrating sphere)."""
+    return photo * (1 - bounced_off)
+
+
+def test_bright_tissue_and_the_light_that_it_throws_settle_where_they_agree():
+    """Each found beside the last of the other, they swing ever wider."""
+    albedo = np.array([0.9, 0.6, 0.2])
+    photo = albedo / (1 - albedo)
+    calm = swinging = np.array([0.8, 0.5, 0.3])
+    for _ in range(12):
+        target = torch.from_numpy(np.log(tissue_under(calm, photo)))
+        growth = torch.from_numpy(calm / (1 - calm))
+        calm = settled(torch.from_numpy(np.log(calm)), target, growth, scaled=False).exp().numpy()
+        swinging = np.clip(tissue_under(swinging, photo), 0, 0.99)
+    np.testing.assert_allclose(calm, albedo, rtol=1e-3)
+    assert np.abs(swinging - albedo)[0] > 0.3
+
+
+def test_a_scale_that_was_found_is_taken_at_once_and_a_tint_in_part():
+    level, tint = torch.zeros(3), torch.tensor([0.3, -0.1, -0.2])
+    found = settled(level, 0.5 + tint, growth=torch.full((3,), 1.0), scaled=True)
+    np.testing.assert_allclose(found, 0.5 + tint / 2, rtol=1e-6)

@@ -127,7 +127,7 @@ def in_a_tube(samples: Samples) -> Samples:
     def uniform(low: float, high: float, *shape: int) -> torch.Tensor:
         return low + (high - low) * torch.rand(len(samples), *shape, generator=generator, dtype=torch.float64)
 
-    bounce = Bounce(uniform(-3, -1, 3), uniform(-0.5, 0), uniform(-4, -2), uniform(1, 2), uniform(0, 0.1))
+    bounce = Bounce(uniform(-3, -1, 3), uniform(-0.5, 0), uniform(-4, -2), uniform(1, 2, 3), uniform(0, 0.1))
     return replace(samples, bounce=bounce)
 
 

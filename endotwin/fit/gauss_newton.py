@@ -45,7 +45,7 @@ COARSE_MM = 12.0
 
 GLOBAL_MEAN = (0.0, *LIGHT_MEAN, math.log(F0_DIELECTRIC), 0.0)
 GLOBAL_SPREAD = (5.0, *LIGHT_SPREAD, 0.5, 0.5)
-GLOBAL_RANGE = ((-20.0, 20.0), (0.0, 10.0), (0.0, 4.0), (0.15, 1.5), (-6.0, -0.7), (-1.5, 1.5))
+GLOBAL_RANGE = ((-20.0, 20.0), (0.0, 10.0), (0.0, 4.0), (0.15, 1.5), (-6.0, -0.7), (-4.0, 4.0))
 """Prior and bounds of the shared parameters, in the order of BOUNCE_GLOBALS."""
 
 USUAL_SIGMAS = 3.0
@@ -53,19 +53,16 @@ AT_EDGE = 0.01
 """Beyond so many standard deviations of the prior, and so near an edge of their range in shares of one, n, q
 and γ are no endoscope's."""
 
-DARKEST_LOG_SCALE = -1.2
-"""With albedos scaled by less than e to this the brightest tissue would reflect a quarter of the light."""
-
-BRIGHTEST = 0.9
-"""Share of the light that the brightest tissue may reflect: a mesh that lacks what throws light on it asks
-for more, until the tissue would be a furnace."""
+DARKEST, BRIGHTEST = 0.24, 0.9
+"""Shares of the light between which the brightest tissue (98th percentile) reflects: less is asked for where
+no light bounces; more where a mesh lacks what throws light on it, until the tissue would be a furnace."""
 
 COLOR_RANGE = (1e-3, 2.0)
 
 CG_TOLERANCE = 1e-3
 CG_STEPS = 25
 SEARCH_SAMPLES = 300_000
-LENGTHS = (1.0, 0.5, 0.25, 0.1)
+LENGTHS = (1.0, 0.5, 0.25, 0.1, 0.03)
 """Of the line search, as shares of the full step."""
 
 
@@ -215,9 +212,15 @@ class GaussNewton:
         equations = assemble(
             self._placed, self.pattern, self._triangles, state.materials, state.shared, HUBER * noise, joint
         )
-        table_step, shared_step = self._solve(state, equations, scale, joint)
+        free = free_directions(state.shared, self.held) if joint else np.zeros((len(state.shared.vector), 0))
+        table_step, shared_step = self._solve(state, equations, scale, free)
+        room = room_below_furnace(state, float(shared_step[-1])) if joint and state.shared.bounces else 1.0
+        if room < LENGTHS[-1]:
+            room, free = 1.0, free_directions(state.shared, (*self.held, "albedo scale"))
+            table_step, shared_step = self._solve(state, equations, scale, free)
+        trusted = float((self._global_prior(state)[1] / shared_step.abs().clamp_min(1e-12)).min())
         before = self._cost(state, noise)
-        for length in LENGTHS:
+        for length in (min(1.0, room, trusted) * each for each in LENGTHS):
             moved = replace(
                 state,
                 table=state.table + length * table_step,
@@ -232,7 +235,7 @@ class GaussNewton:
         return predict(self._trial, at_pixels(self._trial, self._triangles, state.materials), state.shared)
 
     def _solve(
-        self, state: State, equations: NormalEquations, scale: float, joint: bool
+        self, state: State, equations: NormalEquations, scale: float, free: np.ndarray
     ) -> tuple[Tensor, Tensor]:
         link = state.link_slope[..., None]
         mean, spread = self._global_prior(state)
@@ -244,8 +247,7 @@ class GaussNewton:
             back = self._operator.adjoint_csr @ vertex.reshape(len(vertex), -1)
             return back.reshape(rows, CHANNELS, columns) + self.precision[..., None] * x
 
-        free = free_directions(state.shared, self.held) if joint else np.zeros((len(spread), 0))
-        right = equations.right
+        joint, right = free.shape[1] > 0, equations.right
         if joint:
             right = torch.cat([right[..., :1], right[..., 1:] @ self._placed_matrix(free)], dim=2)
         right = (right * link * scale).reshape(len(link), -1)
@@ -373,21 +375,43 @@ def unusual(shared: Globals) -> list[str]:
     return found
 
 
-def darkest(shared: Globals) -> bool:
+def too_dark(state: State) -> bool:
     """Whether light between tissue asks for darker tissue than there is."""
-    return shared.log_scale <= DARKEST_LOG_SCALE
+    return brightest(state) * math.exp(state.shared.log_scale) < DARKEST
 
 
 def without_furnace(state: State) -> State:
-    """``state`` with the albedo's scale such that the brightest tissue (98th percentile) reflects at most
-    BRIGHTEST."""
-    brightest = float(np.percentile(state.materials[:, :3].amax(dim=1).numpy(), 98))
-    limit = math.log(BRIGHTEST / brightest)
-    if state.shared.log_scale <= limit:
-        return state
+    """``state`` with the albedo's scale such that the brightest tissue reflects at most BRIGHTEST."""
+    limit = math.log(BRIGHTEST / brightest(state))
+    return state if state.shared.log_scale <= limit else rescaled(state, limit)
+
+
+def room_below_furnace(state: State, step: float) -> float:
+    """The share of a ``step`` of the albedo's log scale, at most 1, after which the tissue is no furnace."""
+    room = math.log(BRIGHTEST / brightest(state)) - state.shared.log_scale
+    return 1.0 if step <= room else max(room, 0.0) / step
+
+
+def brightest(state: State) -> float:
+    """98th percentile of the brightest albedo channel, unscaled."""
+    return float(np.percentile(state.materials[:, :3].amax(dim=1).numpy(), 98))
+
+
+def as_bouncing(state: State, before: State) -> State:
+    """``state`` with the albedo's scale such that light bounces as a step from ``before`` has found it.
+
+    A step takes the bounce for that of the old base colours, scaled: what the colours have gained since would
+    bounce on top, and scale and colours would swing against each other from step to step.
+    """
+    gained = (state.materials[:, :3].mean(dim=0) / before.materials[:, :3].mean(dim=0)).log().mean()
+    return rescaled(state, state.shared.log_scale - float(gained))
+
+
+def rescaled(state: State, log_scale: float) -> State:
+    """``state`` with another scale of the albedo."""
     vector = state.shared.vector.clone()
-    vector[-1] = limit
-    return replace(state, shared=replace(state.shared, vector=vector))
+    vector[-1] = log_scale
+    return replace(state, shared=bounded(state.shared, vector))
 
 
 def bounded(shared: Globals, vector: Tensor) -> Globals:

@@ -14,7 +14,7 @@ from endotwin.effects import Effects
 from endotwin.effects.gain import Gain
 from endotwin.effects.offset import Offset
 from endotwin.fit.gauss_newton import HUBER, GaussNewton, State
-from endotwin.fit.model import Globals, at_pixels, slope_by_log_exposure
+from endotwin.fit.model import Globals, at_pixels, radiance, slope_by_log_exposure
 from endotwin.fit.normal_equations import Residual
 from endotwin.fit.within import Renewed, Varied
 from endotwin.light import shading
@@ -28,6 +28,10 @@ from endotwin.surface.vectors import unit
 
 MOST_STEP = 1.0
 """Of the logarithm of a gain: a photo all black or white tells none, and its slope is next to nothing."""
+
+
+SHARE_SAMPLES = 20_000
+"""Samples that tell how much of the light has bounced."""
 
 
 def lit(samples: Samples, surface: Surface, caster: Caster, effects: Effects) -> Samples:
@@ -161,8 +165,11 @@ class Relighting:
         samples = self.bounced(samples, triangles, state)
         return exposed(samples, self.effects) if "gain" in self.effects else samples
 
-    def __call__(self, solver: GaussNewton, state: State) -> None:
-        """Relight the samples of ``solver`` as ``state`` says."""
+    def __call__(self, solver: GaussNewton, state: State, scaled: bool = False) -> None:
+        """Relight the samples of ``solver`` as ``state`` says, whose albedo's scale ``as_bouncing`` has left
+        as a step found it where it is ``scaled``."""
+        if self.bounces:
+            self._bouncer.settle(state, _growth(solver, state), scaled)
         samples = self.relit(solver.samples, solver.triangles, state)
         if "gain" in self.effects and state.textured:
             solver.relight(samples)
@@ -182,6 +189,13 @@ class Bouncer:
         self._radiosity = Radiosity(surface, caster, effects["interreflection"].cell_mm)
         guides_mm = effects.guides_mm or AT_LENS
         self._light = BouncedLight(self._radiosity, views.T_local_camera, guides_mm, effects.profile)
+        self._level: Tensor | None = None
+
+    def settle(self, state: State, growth: Tensor, scaled: bool) -> None:
+        """Bring the mean colour that light bounces off nearer to that of ``state``, see ``settled``."""
+        target = _level(state.materials, state.shared.log_scale)
+        level = target if self._level is None else self._level
+        self._level = settled(level, target, growth, scaled)
 
     def bounced(
         self, samples: Samples, roughness: Tensor, materials: Tensor, triangles: Tensor, shared: Globals
@@ -190,7 +204,8 @@ class Bouncer:
         ``materials`` [V, 4] at the corners of ``triangles`` [F, 3]."""
         _, n, q = shared.log_light
         scale, f0 = shared.log_scale, shared.f0 * math.exp(shared.log_scale)
-        albedo = Albedo.of(self._radiosity, materials[:, :3], materials[:, 3], f0, triangles.numpy())
+        base_color = materials[:, :3] * (self._level - _level(materials, scale)).exp()
+        albedo = Albedo.of(self._radiosity, base_color, materials[:, 3], f0, triangles.numpy())
         vertex = samples.nearest(self._surface.triangles)
         places = Places(self._radiosity.to_vertex[vertex], samples.views.row(samples.frame))
         gloss = shading.specular_of_even_light(samples.cos, roughness, f0) * math.exp(-scale)
@@ -218,3 +233,35 @@ def regained(samples: Samples, material: Tensor, shared: Globals, effects: Effec
 def _brightened(effects: Effects, log_gain: np.ndarray) -> Effects:
     gain, step = effects["gain"], np.clip(log_gain, -MOST_STEP, MOST_STEP)
     return effects.including(Gain.centred(gain.frames, np.add(gain.log_gain, step)))
+
+
+def settled(level: Tensor, target: Tensor, growth: Tensor, scaled: bool) -> Tensor:
+    """ln of the mean albedo [3] to bounce light off next, between that of now and the ``target`` of materials
+    that were found beside the light of now.
+
+    Brighter tissue throws more light, under which the photos ask for darker tissue. Taken at once, a colour
+    whose light grows by more than itself would swing with growing strides: 1/(1 + growth) of the way is
+    Newton's step, with ``growth`` d ln x / d ln albedo of the radiance x by bounced light alone. What all
+    colours have in common is taken at once where it was found as their scale (``scaled``).
+    """
+    change = target - level
+    found = change.mean() if scaled else 0.0
+    return level + found + (change - found) / (1 + growth)
+
+
+def _growth(solver: GaussNewton, state: State) -> Tensor:
+    """d ln x / d ln albedo by bounced light alone, of the mean radiance x of the samples, [3]; 0 before any
+    has bounced."""
+    samples = solver.samples
+    if samples.bounce is None:
+        return torch.zeros(3)
+    samples = samples[torch.arange(0, len(samples), max(1, len(samples) // SHARE_SAMPLES))]
+    material = at_pixels(samples, solver.triangles, state.materials)
+    direct = radiance(replace(samples, bounce=None), material, state.shared).mean(dim=0)
+    bounced = 1 - direct / radiance(samples, material, state.shared).mean(dim=0)
+    return bounced * samples.bounce.by_scale.mean(dim=0)
+
+
+def _level(materials: Tensor, log_scale: float) -> Tensor:
+    """ln of the mean albedo of ``materials`` [V, 4], scaled, [3]."""
+    return materials[:, :3].mean(dim=0).log() + log_scale

@@ -69,9 +69,14 @@ class Globals:
         return replace(self, vector=self.vector[: len(GLOBALS)])
 
     @property
+    def bounces(self) -> bool:
+        """Whether light bounces between tissue."""
+        return len(self.vector) > len(GLOBALS)
+
+    @property
     def log_scale(self) -> float:
         """ln of the factor on all albedo; 0 without interreflection."""
-        return float(self.vector[5]) if len(self.vector) > len(GLOBALS) else 0.0
+        return float(self.vector[5]) if self.bounces else 0.0
 
 
 def at_pixels(samples: Samples, triangles: Tensor, per_vertex: Tensor) -> Tensor:
@@ -156,7 +161,7 @@ def linearise(samples: Samples, material: Tensor, shared: Globals) -> Linearised
     by_gamma = by_gamma - by_color * base_color * torch.log(base_color) / gamma
     by_globals = [by_light * x, by_light * axis, -by_light * distance, by_gamma, slope * shine[:, None]]
     if samples.bounce is not None:
-        by_globals.append(slope * glow * samples.bounce.by_scale[:, None])
+        by_globals.append(slope * glow * samples.bounce.by_scale)
     return Linearised(
         predicted=power - floor,
         by_color=by_color,

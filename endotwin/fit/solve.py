@@ -25,8 +25,9 @@ from endotwin.fit.gauss_newton import (
     CPU,
     GaussNewton,
     State,
-    darkest,
+    as_bouncing,
     roughness_to_raw,
+    too_dark,
     unusual,
     without_furnace,
 )
@@ -242,7 +243,10 @@ def _find_light(
     state = State(operator, mean, table, shared)
     relighting(solver, state)
     ready = pace.stopwatch.total
+    before = state
     state, _ = solver.step(state, joint=False)
+    if relighting.bounces:
+        state = as_bouncing(state, before)
     step_s = pace.stopwatch.total - ready
     number, steps = 0, BOUNCE_STEPS if relighting.bounces else LIGHT_STEPS
     judged = None
@@ -252,9 +256,9 @@ def _find_light(
             break
         if relighting.bounces:
             state = without_furnace(state)
-            if darkest(state.shared):
+            if too_dark(state):
                 state, steps = relighting.without_bounce(solver, state), number + LIGHT_STEPS
-        relighting(solver, state)
+        relighting(solver, state, scaled=True)
         within = Within.of(solver.samples, surface, unit)
         material = at_pixels(solver.samples, solver.triangles, state.materials)
         shared, noise = state.shared, solver.noise(state)
@@ -274,7 +278,12 @@ def _find_light(
         state = replace(state, shared=shared)
         if late:
             break
+        before = state
         state, gain = solver.step(state, joint=relighting.bounces)
+        if relighting.bounces and not gain:
+            state, gain = solver.step(state, joint=False)
+        if relighting.bounces:
+            state = as_bouncing(state, before)
         number += 1
         pace.report("find the light", number, steps)
         if gain < CONVERGED * solver.cost(state, solver.noise(state)):

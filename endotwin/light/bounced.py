@@ -79,7 +79,7 @@ class Bounce:
     all albedo.
 
     Attributes:
-        log: float32 [N, 3]. by_n, by_q, by_scale: float32 [N].
+        log, by_scale: float32 [N, 3]. by_n, by_q: float32 [N], the channels' mean.
         gloss: float32 [N], share of it that the specular lobe sends to the camera.
     """
 
@@ -96,13 +96,10 @@ class Bounce:
     def __getitem__(self, index) -> Bounce:
         return Bounce(**{name: value[index] for name, value in vars(self).items()})
 
-    def log_factor(self, n: float, q: float, log_scale: float = 0.0) -> Tensor:
-        """ln E − ``log`` with L0 = 1, [N]."""
-        return n * self.by_n + q * self.by_q + log_scale * self.by_scale
-
     def irradiance(self, n: float, q: float, log_scale: float = 0.0) -> Tensor:
         """E with L0 = 1, [N, 3]."""
-        return torch.exp(self.log + self.log_factor(n, q, log_scale)[:, None])
+        by_light = (n * self.by_n + q * self.by_q)[:, None]
+        return torch.exp(self.log + by_light + log_scale * self.by_scale)
 
 
 class BouncedLight:
@@ -130,7 +127,7 @@ class BouncedLight:
     ) -> Bounce:
         """The bounce as a function of n, q and the albedo's scale, exact where they are as given here.
 
-        Slopes are the channels' mean. ``gloss`` [N] is the bounce's.
+        ``gloss`` [N] is the bounce's.
         """
 
         def log_irradiance(n: float, q: float, log_scale: float) -> np.ndarray:
@@ -142,7 +139,10 @@ class BouncedLight:
             (n, q + LIGHT_STEP, log_scale),
             (n, q, log_scale + LIGHT_STEP),
         )
-        slopes = [(log_irradiance(*at) - here).mean(axis=1) / LIGHT_STEP for at in moved]
-        level = here - (n * slopes[0] + q * slopes[1] + log_scale * slopes[2])[:, None]
-        columns = [torch.from_numpy(np.ascontiguousarray(x, np.float32)) for x in (level, *slopes)]
+        by_n, by_q, by_scale = ((log_irradiance(*at) - here) / LIGHT_STEP for at in moved)
+        by_n, by_q = by_n.mean(axis=1), by_q.mean(axis=1)
+        level = here - (n * by_n + q * by_q)[:, None] - log_scale * by_scale
+        columns = [
+            torch.from_numpy(np.ascontiguousarray(x, np.float32)) for x in (level, by_n, by_q, by_scale)
+        ]
         return Bounce(*columns, gloss)
