@@ -24,12 +24,13 @@ demo: venv
 	$(BIN)/python examples/demo.py
 
 test test-fast: export PYTHONDONTWRITEBYTECODE :=  # else every process compiles all of it again
+PYTEST = $(BIN)/python -m pytest -n auto --dist loadfile --no-loadscope-reorder  # few tests may take long
 
 test: venv
-	$(BIN)/python -m pytest -n auto --dist loadfile
+	$(PYTEST)
 
 test-fast: venv
-	$(BIN)/python -m pytest -n auto --dist loadfile -m "not slow"
+	$(PYTEST) -m "not slow"
 
 clean:
 	rm -rf .venv demo
