@@ -394,7 +394,7 @@ def room_below_furnace(state: State, step: float) -> float:
 
 def brightest(state: State) -> float:
     """98th percentile of the brightest albedo channel, unscaled."""
-    return float(np.percentile(state.materials[:, :3].amax(dim=1).numpy(), 98))
+    return float(np.percentile(state.materials[:, :3].amax(dim=1).cpu().numpy(), 98))
 
 
 def as_bouncing(state: State, before: State) -> State:

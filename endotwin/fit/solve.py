@@ -243,10 +243,7 @@ def _find_light(
     state = State(operator, mean, table, shared)
     relighting(solver, state)
     ready = pace.stopwatch.total
-    before = state
-    state, _ = solver.step(state, joint=False)
-    if relighting.bounces:
-        state = as_bouncing(state, before)
+    state, _ = _stepped(solver, state, relighting, joint=False)
     step_s = pace.stopwatch.total - ready
     number, steps = 0, BOUNCE_STEPS if relighting.bounces else LIGHT_STEPS
     judged = None
@@ -278,12 +275,7 @@ def _find_light(
         state = replace(state, shared=shared)
         if late:
             break
-        before = state
-        state, gain = solver.step(state, joint=relighting.bounces)
-        if relighting.bounces and not gain:
-            state, gain = solver.step(state, joint=False)
-        if relighting.bounces:
-            state = as_bouncing(state, before)
+        state, gain = _stepped(solver, state, relighting, joint=relighting.bounces)
         number += 1
         pace.report("find the light", number, steps)
         if gain < CONVERGED * solver.cost(state, solver.noise(state)):
@@ -292,6 +284,15 @@ def _find_light(
         state = without_furnace(state)
     cost = _Cost(ready - began, step_s, len(points) * len(operator.cells_mm), len(samples))
     return state, cost, judged or Decision("off", "no time to judge")
+
+
+def _stepped(solver: GaussNewton, state: State, relighting: Relighting, joint: bool) -> tuple[State, float]:
+    """A step of ``solver``, of the materials alone where a ``joint`` one finds nothing lower, and by how much
+    the cost fell; light bounces after it as it was found to."""
+    stepped, gain = solver.step(state, joint)
+    if joint and not gain:
+        stepped, gain = solver.step(state, joint=False)
+    return as_bouncing(stepped, state) if relighting.bounces else stepped, gain
 
 
 def _find_detail(
