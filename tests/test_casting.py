@@ -65,7 +65,7 @@ def swollen(surface: Surface, share: float) -> Surface:
 @pytest.mark.parametrize("known", [True, False], ids=["refitted", "built anew"])
 def test_a_moved_casters_hits_are_those_of_a_new_one_whatever_it_was_before(surface, known, monkeypatch):
     if not known:
-        monkeypatch.setattr(embree, "library", lambda: None)
+        monkeypatch.setattr(embree, "loaded", lambda: None)
     origins, directions = random_rays(50_000)
     caster = Caster(surface)
     for share in (0.3, -0.2, 0.1):

@@ -28,7 +28,7 @@ from endotwin.fit.lighting import Relighting, lit
 from endotwin.fit.model import at_pixels, radiance
 from endotwin.light import shading
 from endotwin.light.film import Film, mirrored, mirrors_in_view
-from endotwin.light.guides import AT_LENS
+from endotwin.light.guides import lamps_mm
 from endotwin.pixels.samples import Samples, Views, frame_samples
 from endotwin.run.ahead import ahead
 from endotwin.run.threads import THREADS
@@ -360,7 +360,7 @@ def mirrors_of(
     """Half vectors [P, K, 3] in the surface's frame and strengths [P, K] of the guides, 0 in their shadow, at
     the vertices ``vertex[place]`` in the views ``row`` (ascending), both [P]."""
     effects, surface = model.relighting.effects, model.twin.surface
-    guides_mm = np.asarray(effects.guides_mm or AT_LENS, np.float32)
+    guides_mm = lamps_mm(effects.guides_mm)
     caster = model.caster if "shadows" in effects else None
     halves, strengths = [torch.zeros(0, len(guides_mm), 3)], [torch.zeros(0, len(guides_mm))]
     for view in np.unique(row):

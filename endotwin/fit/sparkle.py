@@ -29,10 +29,11 @@ from endotwin.fit.film import Found as FoundFilm
 from endotwin.fit.lighting import lit
 from endotwin.light import shading
 from endotwin.light.film import Film, film_in_view, mirrors, mirrors_in_view
-from endotwin.light.guides import AT_LENS
+from endotwin.light.guides import lamps_mm
 from endotwin.pixels.samples import CLIPPED, Samples, Views, frame_samples
 from endotwin.run.ahead import ahead
 from endotwin.run.threads import THREADS
+from endotwin.surface.rows import Rows
 from endotwin.surface.vectors import dot, unit
 
 PHOTOS = 6
@@ -164,7 +165,7 @@ class _Photo:
 
 
 def _guides(model: Model) -> np.ndarray:
-    return np.asarray(model.relighting.effects.guides_mm or AT_LENS, np.float32)
+    return lamps_mm(model.relighting.effects.guides_mm)
 
 
 def _exposure(samples: Samples) -> np.ndarray | float:
@@ -172,7 +173,7 @@ def _exposure(samples: Samples) -> np.ndarray | float:
 
 
 @dataclass(frozen=True, eq=False)
-class _Places:
+class _Places(Rows):
     """How pixels stand to K guides.
 
     Attributes:
@@ -205,9 +206,6 @@ class _Places:
         corners = model.twin.surface.triangles[samples.triangle.numpy()]
         wet = np.ones(len(index), bool) if film is None else film.wets(corners)
         return cls(1 / cos_m**2 - 1, cos_i.numpy(), gain, cos_o, photo.least[index], seen_mm2 / cos_o, wet)
-
-    def __getitem__(self, index: np.ndarray) -> _Places:
-        return _Places(*(value[index] for value in vars(self).values()))
 
     @property
     def flat(self) -> np.ndarray:

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from endotwin.light.radiosity import Radiosity
 from endotwin.light.shading import specular_albedo
+from endotwin.surface.rows import Rows
 
 LIGHT_STEP = 0.05
 """Step of the finite differences of the bounced light, in n, q and the logarithm of all albedo."""
@@ -74,7 +75,7 @@ class Places:
 
 
 @dataclass(frozen=True)
-class Bounce:
+class Bounce(Rows):
     """Indirect irradiance at N points, E = L0·exp(log + n·by_n + q·by_q + ln κ·by_scale), κ a factor on
     all albedo.
 
@@ -92,9 +93,6 @@ class Bounce:
     def to(self, device: torch.device) -> Bounce:
         """The same on ``device``."""
         return Bounce(**{name: value.to(device) for name, value in vars(self).items()})
-
-    def __getitem__(self, index) -> Bounce:
-        return Bounce(**{name: value[index] for name, value in vars(self).items()})
 
     def irradiance(self, n: float, q: float, log_scale: float = 0.0) -> Tensor:
         """E with L0 = 1, [N, 3]."""

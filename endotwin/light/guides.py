@@ -5,6 +5,7 @@ Vocabulary of ``shading``: ``wi`` unit direction to the guide, ``wo`` to the cam
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,6 +14,7 @@ from torch import Tensor
 
 from endotwin.light.incidence import COS_MIN, DISTANCE_MIN_MM
 from endotwin.surface.casting import Caster
+from endotwin.surface.rows import Rows
 from endotwin.surface.vectors import dot, unit
 
 SHADOW_BIAS = 0.015
@@ -27,7 +29,7 @@ AT_LENS = ((0.0, 0.0, 0.0),)
 
 
 @dataclass(frozen=True)
-class Guided:
+class Guided(Rows):
     """How K guides light N points.
 
     Attributes:
@@ -48,9 +50,6 @@ class Guided:
     def to(self, device: torch.device) -> Guided:
         """The same on ``device``."""
         return Guided(**{name: value.to(device) for name, value in vars(self).items()})
-
-    def __getitem__(self, index) -> Guided:
-        return Guided(**{name: value[index] for name, value in vars(self).items()})
 
 
 def log_axis(cos_axis: np.ndarray, profile: float) -> np.ndarray:
@@ -107,3 +106,8 @@ def visible_from(
         origin = np.broadcast_to(centre + rotation @ guide_mm, directions.shape)
         seen[:, k] = caster.unobstructed(origin, directions, distance_mm * (1 - SHADOW_BIAS))
     return seen
+
+
+def lamps_mm(guides_mm: Sequence | None) -> np.ndarray:
+    """Where light comes from, camera frame, float32 [K, 3]: ``guides_mm`` [K, 3], or the lens (None)."""
+    return np.asarray(guides_mm or AT_LENS, np.float32)

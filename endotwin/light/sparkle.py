@@ -16,6 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from endotwin.surface.rows import Rows
 from endotwin.surface.vectors import dot, unit
 
 REACH = 3.0
@@ -23,7 +24,7 @@ REACH = 3.0
 
 
 @dataclass(frozen=True, eq=False)
-class Facing:
+class Facing(Rows):
     """How F triangles face: unit normals and two tangents each, float32 [F, 3], by the first edge; so the
     frame moves with tissue that does."""
 
@@ -39,9 +40,6 @@ class Facing:
         first = unit(edge - dot(edge, normal)[:, None] * normal)
         return cls(normal, first, np.cross(normal, first))
 
-    def __getitem__(self, index: np.ndarray) -> Facing:
-        return Facing(*(value[index] for value in vars(self).values()))
-
     def slope(self, direction: np.ndarray) -> np.ndarray:
         """Slopes [F, ..., 2] of the microfacets whose normals [F, ..., 3] those are; inf where they face
         away."""
@@ -52,7 +50,7 @@ class Facing:
 
 
 @dataclass(frozen=True, eq=False)
-class Facets:
+class Facets(Rows):
     """N facets.
 
     Attributes:
@@ -67,9 +65,6 @@ class Facets:
 
     def __len__(self) -> int:
         return len(self.row)
-
-    def __getitem__(self, index: np.ndarray) -> Facets:
-        return Facets(*(value[index] for value in vars(self).values()))
 
 
 def lobe(apart2: np.ndarray, width: float) -> np.ndarray:

@@ -15,7 +15,7 @@ from endotwin.light import shading
 from endotwin.light.bounced import Albedo, BouncedLight, Places
 from endotwin.light.film import film_in_view
 from endotwin.light.forward import Lit, Lobes, radiance
-from endotwin.light.guides import AT_LENS, COSINE, guided, log_axis, visible_from
+from endotwin.light.guides import AT_LENS, COSINE, guided, lamps_mm, log_axis, visible_from
 from endotwin.light.incidence import COS_MIN, incidence_on
 from endotwin.light.radiosity import Radiosity
 from endotwin.surface.casting import Caster, Correspondences
@@ -75,7 +75,7 @@ class Illumination:
             effects["film"].roughness,
             twin.surface.vertices_mm,
             T_local_camera,
-            np.asarray(effects.guides_mm or AT_LENS, np.float32),
+            lamps_mm(effects.guides_mm),
             effects.profile,
             log_light(twin),
             self._caster if "shadows" in effects else None,

@@ -12,7 +12,7 @@ import torch
 from endotwin.cameras.base import Camera, solid_angle
 from endotwin.light import shading
 from endotwin.light.film import mirrors
-from endotwin.light.guides import AT_LENS, visible_from
+from endotwin.light.guides import lamps_mm, visible_from
 from endotwin.light.sparkle import REACH, Facets, Facing, bare, facets_about, lobe
 from endotwin.render.illumination import ViewLight, log_light
 from endotwin.surface.vectors import dot, unit
@@ -98,7 +98,7 @@ class _Scene:
 
     @property
     def guides_mm(self) -> np.ndarray:
-        return np.asarray(self.light.twin.effects.guides_mm or AT_LENS, np.float32)
+        return lamps_mm(self.light.twin.effects.guides_mm)
 
     def mirrors(self, points_mm: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """``film.mirrors`` of points [N, 3]: half vectors [N, K, 3] and strengths [N, K]."""

@@ -35,10 +35,10 @@ FUNCTIONS = (
 
 
 def handle(scene: rtcore_scene.EmbreeScene, device: rtcore.EmbreeDevice) -> int | None:
-    """That of a ``scene`` on its ``device`` within ``library``; None where embreex is not as it is known
+    """That of a ``scene`` on its ``device`` within ``loaded``; None where embreex is not as it is known
     here."""
     head, pointer = object.__basicsize__, sizeof(c_void_p)
-    if library() is None or type(scene).__basicsize__ != head + 3 * pointer:
+    if loaded() is None or type(scene).__basicsize__ != head + 3 * pointer:
         return None
     committed = c_int.from_address(id(scene) + head + pointer)
     owner = c_void_p.from_address(id(scene) + head + 2 * pointer)
@@ -48,7 +48,7 @@ def handle(scene: rtcore_scene.EmbreeScene, device: rtcore.EmbreeDevice) -> int 
 
 
 @cache
-def library() -> ctypes.CDLL | None:
+def loaded() -> ctypes.CDLL | None:
     """Embree 4 as embreex has loaded it; None where that is not found."""
     package = Path(embreex.__file__).parent
     files = [file for place in PLACES for file in sorted((package / place).glob("*embree4*"))]

@@ -55,7 +55,7 @@ class Packets:
         """Those of a ``scene`` on its ``device``; None where there is no handle of it."""
         handle = embree.handle(scene, device)
         scene.run(np.zeros((1, 3), np.float32), np.ones((1, 3), np.float32))  # which builds its tree
-        return None if handle is None else cls(embree.library(), handle)
+        return None if handle is None else cls(embree.loaded(), handle)
 
     def first_hits(
         self, origin: np.ndarray, directions: np.ndarray, valid: np.ndarray

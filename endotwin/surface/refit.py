@@ -42,7 +42,7 @@ class Refit:
         """That of a ``scene`` on its ``device`` with one mesh of so many vertices; None where there is no
         handle of it."""
         handle = embree.handle(scene, device)
-        return None if handle is None else cls(embree.library(), scene, handle, vertices)
+        return None if handle is None else cls(embree.loaded(), scene, handle, vertices)
 
     def move(self, vertices_mm: np.ndarray) -> None:
         """Fit the tree to the mesh's vertices float32 [V, 3] as they are now."""

@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 from torch.nn.functional import embedding_bag
 
 from endotwin.surface import Surface
+from endotwin.surface.rows import Rows
 from endotwin.surface.vectors import dot, unit
 from endotwin.synth.trajectories.centerline import Centerline, arc_length, lengthened
 
@@ -73,7 +74,7 @@ class Line:
 
 
 @dataclass(frozen=True, eq=False)
-class Places:
+class Places(Rows):
     """Points on or about the line.
 
     Attributes:
@@ -99,9 +100,6 @@ class Places:
         found = cls(below, (at - below).astype(np.float32), np.zeros(0), slope.astype(np.float32))
         across = (points - found.of_table(line.points)).astype(np.float32)
         return cls(below, found.share, across, found.slope)
-
-    def __getitem__(self, chosen: np.ndarray) -> Places:
-        return Places(*(value[chosen] for value in vars(self).values()))
 
     def of_table(self, table: np.ndarray) -> np.ndarray:
         """Values of a table [S, ...] of the line's stations at the points, [N, ...]."""

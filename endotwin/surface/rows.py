@@ -1,0 +1,14 @@
+"""Dataclasses of arrays that have a row for each of N things."""
+
+from __future__ import annotations
+
+from dataclasses import fields
+from typing import Self
+
+
+class Rows:
+    """Base of a dataclass all of whose fields are arrays or tensors of as many rows."""
+
+    def __getitem__(self, index) -> Self:
+        """Those that ``index`` names: numbers [M], bool [N], or a slice."""
+        return type(self)(*(getattr(self, field.name)[index] for field in fields(self)))
