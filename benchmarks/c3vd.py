@@ -38,7 +38,7 @@ REGISTERED = [f"{segment}_{name}" for segment, names in SEGMENTS.items() for nam
 TEN = ["cecum_t1_b", "cecum_t2_b", "cecum_t3_a", "sigmoid_t1_a", "sigmoid_t2_a", "sigmoid_t3_a"]
 TEN += ["trans_t1_b", "trans_t2_c", "trans_t4_a", "trans_t4_b"]
 
-LPIPS = "LPIPS: AlexNet, images in [-1, 1], ignored pixels black in both; published ones may be of VGG"
+LPIPS = "LPIPS: AlexNet, VGG: VGG-16; images in [-1, 1], ignored pixels black in both; published: of either"
 
 
 @dataclass(frozen=True)
@@ -99,9 +99,20 @@ COLUMNS = (
     "PSNR",
     "SSIM",
     "LPIPS",
+    "LPIPS VGG",
     "PSNR covered",
 )
 COLUMNS += ("covered", "note")
+
+SCORES = (
+    ("PSNR", "psnr", 2),
+    ("SSIM", "ssim", 3),
+    ("LPIPS", "lpips", 3),
+    ("LPIPS VGG", "lpips_vgg", 3),
+    ("PSNR covered", "psnr_covered", 2),
+    ("covered", "covered", 4),
+)
+"""Columns of scores, their names in a row, and their digits."""
 
 
 def found(root: Path) -> dict[str, Path]:
@@ -140,6 +151,8 @@ def score(folder: Path, options: tuple[str, ...], work: Path) -> dict:
     if done.returncode:
         return {**row, "note": f"eval: {done.stderr.strip().splitlines()[-1]}"}
     scores = json.loads(done.stdout)
+    if scores["lpips"] is not None:
+        row["lpips_vgg"] = json.loads(endotwin("eval", twin, "--json", "--lpips", "vgg").stdout)["lpips"]
     record = json.loads((twin / "twin.json").read_text(encoding="utf-8"))["record"]["fuse"]
     row |= {"fused": len(record["fused"]), **{name: scores[name] for name in ("psnr", "ssim", "lpips")}}
     row |= {name: scores[name] for name in ("psnr_covered", "covered")}
@@ -157,9 +170,8 @@ def cells(name: str, row: dict) -> dict[str, str]:
         told[key] = f"{row[key]['seconds']:.0f} s" if key in row else ""
     peaks = [row[key]["peak_memory_mb"] for key in ("fuse", "align", "fit") if key in row]
     told["memory"] = f"{max(peaks) / 1000:.1f} GB" if peaks else ""
-    for column, key, digits in (("PSNR", "psnr", 2), ("SSIM", "ssim", 3), ("LPIPS", "lpips", 3)):
+    for column, key, digits in SCORES:
         told[column] = shown(row.get(key), digits)
-    told["PSNR covered"], told["covered"] = shown(row.get("psnr_covered"), 2), shown(row.get("covered"), 4)
     return {column: told.get(column, "") for column in COLUMNS}
 
 
@@ -170,8 +182,7 @@ def shown(value: float | None, digits: int) -> str:
 def mean(rows: list[dict]) -> dict:
     """The mean of the scores of all ``rows`` that have them."""
     scored = [row for row in rows if row.get("psnr") is not None]
-    names = ("psnr", "ssim", "lpips", "psnr_covered", "covered")
-    values = {name: [row[name] for row in scored if row.get(name) is not None] for name in names}
+    values = {name: [row[name] for row in scored if row.get(name) is not None] for _, name, _ in SCORES}
     return {name: sum(found) / len(found) for name, found in values.items() if found}
 
 

@@ -43,6 +43,9 @@ def evaluate(
             help="Also score each half of a photo at a pose that was fitted to its other half.",
         ),
     ] = False,
+    lpips: Annotated[
+        str, typer.Option(metavar="alex|vgg", help="The network that LPIPS is of: AlexNet or VGG-16.")
+    ] = "alex",
     json: Annotated[
         bool, typer.Option("--json", help="Print the scores as JSON instead of a table.")
     ] = False,
@@ -86,7 +89,7 @@ def evaluate(
             other = None if sequence is None else open_sequence(sequence, scale=scale or 1.0)
         with run.stage("eval"):
             scored = twin if twin is None or scale is None else twin.at_scale(scale)
-            evaluation = evaluate(scored, sheet, run.progress, overwrite, other, renders, halves)
+            evaluation = evaluate(scored, sheet, run.progress, overwrite, other, renders, halves, lpips)
         print(json_format.dumps(evaluation.to_dict()) if json else evaluation)
         with run.stage("write"):
             own = sequence is None and renders is None

@@ -113,7 +113,7 @@ def test_eval_keeps_the_scores_in_the_twin_and_says_that_lpips_is_missing(
     from endotwin.evaluation import metrics
     from endotwin.twin import Twin
 
-    monkeypatch.setattr(metrics, "_lpips_network", lambda: None)
+    monkeypatch.setattr(metrics, "_lpips_network", lambda name: None)
     shutil.copytree(made / "twin", tmp_path / "twin")
     code, out, _ = endotwin("eval", tmp_path / "twin")
     assert code == 0 and "not installed" in out

@@ -17,7 +17,7 @@ from endotwin.render import Renderer
 from endotwin.sequence.readers import open_sequence
 from endotwin.twin import Light, Materials, Registration, Response, Twin
 
-JSON_KEYS = [*MEANS, "gamma", "light", "frames"]
+JSON_KEYS = [*MEANS, "lpips_network", "gamma", "light", "frames"]
 
 
 @pytest.fixture(scope="module")

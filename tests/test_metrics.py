@@ -1,9 +1,11 @@
 """Image metrics: closed forms, an independent SSIM, and pixels outside the mask that must not matter."""
 
 import sys
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import torch
 from scipy.ndimage import gaussian_filter
 
 from endotwin.evaluation import metrics
@@ -68,6 +70,36 @@ def test_an_empty_mask_has_no_score(images):
     empty = np.zeros_like(mask)
     assert np.isnan(metrics.psnr(photo, render, empty))
     assert np.isnan(metrics.masked_mean(photo[..., 0], empty))
+
+
+@pytest.mark.parametrize("network", metrics.LPIPS_NETWORKS)
+def test_lpips_gives_the_network_asked_for_pictures_between_minus_one_and_one_black_off_the_mask(
+    images, monkeypatch, network
+):
+    photo, render, mask = images
+    asked, given = [], []
+
+    class Network(torch.nn.Module):
+        def __init__(self, net, spatial, verbose):
+            super().__init__()
+            asked.append(net)
+
+        def forward(self, reference, image):
+            given.extend((reference, image))
+            return (reference - image).abs().mean(dim=1, keepdim=True)
+
+    monkeypatch.setitem(sys.modules, "lpips", SimpleNamespace(LPIPS=Network))
+    metrics._lpips_network.cache_clear()
+    try:
+        distance = metrics.lpips_map(photo, render, mask, network)
+    finally:
+        metrics._lpips_network.cache_clear()
+    assert asked == [network]
+    for picture, tensor in zip((photo, render), given, strict=True):
+        shown = (tensor[0].permute(1, 2, 0).numpy() + 1) / 2
+        np.testing.assert_allclose(shown[mask], picture[mask], atol=1e-6)
+        assert (tensor[0][:, ~torch.from_numpy(mask)] == -1).all()
+    assert distance[~mask].max() == 0 and distance[mask].max() > 0
 
 
 def test_lpips_is_absent_where_the_extra_is_not_installed(monkeypatch):

@@ -35,6 +35,7 @@ from endotwin.errors import OptionError, TwinError
 from endotwin.evaluation import metrics
 from endotwin.evaluation.highlights import Alike
 from endotwin.evaluation.kept import keep_scores
+from endotwin.evaluation.metrics import LPIPS_NETWORKS
 from endotwin.evaluation.renders import read_render, rendered_files
 from endotwin.light import shading
 from endotwin.render import Renderer
@@ -109,10 +110,12 @@ class Evaluation:
 
     Attributes:
         frames: one score a held-out frame. scored: the twin that they are of; None: another method's renders.
+        lpips_network: what LPIPS is of.
     """
 
     frames: tuple[FrameScore, ...]
     scored: Twin | None = None
+    lpips_network: str = LPIPS_NETWORKS[0]
 
     @property
     def twin(self) -> Twin | None:
@@ -167,6 +170,7 @@ class Evaluation:
 
         return {
             **{name: plain(self.mean(name)) for name in MEANS},
+            "lpips_network": self.lpips_network,
             "gamma": self.gamma,
             "light": self.light and asdict(self.light),
             "frames": [
@@ -181,8 +185,8 @@ class Evaluation:
         scores = [field.name for field in fields(FrameScore) if field.name not in told]
         rows = [["frame", *scores]]
         for frame in self.frames:
-            rows.append([frame.name, *(_shown(name, getattr(frame, name)) for name in scores)])
-        rows.append(["mean", *(_shown(name, self.mean(name)) for name in scores)])
+            rows.append([frame.name, *(self._shown(name, getattr(frame, name)) for name in scores)])
+        rows.append(["mean", *(self._shown(name, self.mean(name)) for name in scores)])
         widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
         lines = ["  ".join(map(str.rjust, row, widths)) for row in rows]
         if self.light is None:
@@ -191,13 +195,12 @@ class Evaluation:
         lines.append(f"{light}; γ {self.gamma:.4f}; geometry {self.scored.source.geometry}")
         return "\n".join(lines)
 
-
-def _shown(score: str, value: float) -> str:
-    if score.startswith("lpips") and not metrics.lpips_installed():
-        return "not installed"
-    if not math.isfinite(value):
-        return "-"
-    return f"{value:.2f}" if score.startswith("psnr") else f"{value:.4f}"
+    def _shown(self, score: str, value: float) -> str:
+        if score.startswith("lpips") and not metrics.lpips_installed(self.lpips_network):
+            return "not installed"
+        if not math.isfinite(value):
+            return "-"
+        return f"{value:.2f}" if score.startswith("psnr") else f"{value:.4f}"
 
 
 def covered_pixels(hits: Correspondences, surface: Surface, shape: tuple[int, int]) -> np.ndarray:
@@ -308,13 +311,13 @@ def _halved(held_out: _HeldOut, sequence: Sequence, scene: Scene, show: Show) ->
     return dict(zip(HALVES, (whole, of_covered), strict=True))
 
 
-def _score(held_out: _HeldOut) -> FrameScore:
+def _score(held_out: _HeldOut, lpips: str) -> FrameScore:
     photo, render, valid = held_out.photo, held_out.render, held_out.valid
     covered = np.zeros_like(valid) if held_out.covered is None else held_out.covered
     similarity = metrics.ssim_map(photo, render, valid)
     distance = np.full(valid.shape, np.nan)
-    if metrics.lpips_installed():
-        distance = metrics.lpips_map(photo, render, valid)
+    if metrics.lpips_installed(lpips):
+        distance = metrics.lpips_map(photo, render, valid, lpips)
     glints = Alike.of(photo, render, valid)
     return FrameScore(
         index=held_out.frame.index,
@@ -342,6 +345,7 @@ def evaluate(
     sequence: Sequence | Path | str | None = None,
     renders: Path | str | None = None,
     halves: bool = False,
+    lpips: str = LPIPS_NETWORKS[0],
 ) -> Evaluation:
     """Score a fitted twin, or another method's pictures, on frames that were held out of the fit.
 
@@ -356,11 +360,13 @@ def evaluate(
         renders: folder of pictures of the held-out frames, each named as its photo.
         halves: also fit the pose of each photo to one half of it and score the other, and the reverse: what
             the twin is worth where poses err from photo to photo.
+        lpips: the network that LPIPS is of, ``alex`` or ``vgg``.
 
     Raises:
         TwinError: the twin is not fitted, or no held-out frame has a valid pixel.
         SequenceError: the twin's sequence has moved, or a render is missing or of another size.
-        OptionError: ``sequence`` is the twin's own, renders have none, or their poses are asked for.
+        OptionError: ``sequence`` is the twin's own, renders have none, their poses are asked for, or
+            ``lpips`` is no network of LPIPS.
         OutputError: ``sheet`` exists or cannot be written.
     """
     kept = sequence is None and renders is None and not isinstance(twin, Twin)
@@ -368,6 +374,8 @@ def evaluate(
     twin = None if twin is None and renders is not None else as_twin(twin)
     if halves and renders is not None:
         raise OptionError("pictures of another method have no pose to fit; leave --halves or --renders out")
+    if lpips not in LPIPS_NETWORKS:
+        raise OptionError(f"lpips {lpips!r} is no network of LPIPS; choose from {', '.join(LPIPS_NETWORKS)}")
     if sheet is not None:
         check_picture(sheet, overwrite)
     sequence, indices = _to_be_scored(twin, sequence, renders)
@@ -378,7 +386,7 @@ def evaluate(
     scene = Scene.of(Caster(twin.surface), sequence.camera, 0) if halves else None
     scores, rows = [], []
     for held_out in _compared(sequence, indices, show, progress):
-        scores.append(_score(held_out))
+        scores.append(_score(held_out, lpips))
         if scene is not None:
             scores[-1] = replace(scores[-1], **_halved(held_out, sequence, scene, show))
         if sheet is not None:
@@ -389,7 +397,7 @@ def evaluate(
         )
     if sheet is not None:
         write_png(Path(sheet), np.vstack(rows), overwrite)
-    evaluation = Evaluation(tuple(scores), twin if renders is None else None)
+    evaluation = Evaluation(tuple(scores), twin if renders is None else None, lpips)
     if renders is not None:
         return evaluation
     if evaluation.psnr < POOR_DB:

@@ -47,29 +47,37 @@ def masked_mean(values: np.ndarray, mask: np.ndarray) -> float:
     return float(values[mask].mean()) if mask.any() else float("nan")
 
 
+LPIPS_NETWORKS = ("alex", "vgg")
+"""What LPIPS can be of: AlexNet or VGG-16."""
+
+
 @cache
-def _lpips_network():
-    """The LPIPS network, or None where the optional extra ``lpips`` is not installed or does not work."""
+def _lpips_network(name: str):
+    """The LPIPS network of that name, or None where the optional extra ``lpips`` is not installed or does not
+    work."""
     try:
         import lpips
 
-        return lpips.LPIPS(net="alex", spatial=True, verbose=False).eval()
+        return lpips.LPIPS(net=name, spatial=True, verbose=False).eval()
     except ImportError:
         return None
     except (OSError, RuntimeError) as error:  # weights out of reach, or a torchvision made for another torch
-        logger.warning("LPIPS is left out, because its network cannot be loaded: %s", error)
+        logger.warning("LPIPS is left out, because its network %s cannot be loaded: %s", name, error)
         return None
 
 
-def lpips_installed() -> bool:
-    """Whether the optional extra ``lpips`` is there and works."""
-    return _lpips_network() is not None
+def lpips_installed(network: str = "alex") -> bool:
+    """Whether the optional extra ``lpips`` is there and works with that one of LPIPS_NETWORKS."""
+    return _lpips_network(network) is not None
 
 
-def lpips_map(reference: np.ndarray, image: np.ndarray, mask: np.ndarray) -> np.ndarray:
-    """Learned perceptual distance of each pixel, [H, W] (Zhang et al. 2018, AlexNet).
+def lpips_map(
+    reference: np.ndarray, image: np.ndarray, mask: np.ndarray, network: str = "alex"
+) -> np.ndarray:
+    """Learned perceptual distance of each pixel, [H, W] (Zhang et al. 2018), of one of LPIPS_NETWORKS.
 
-    Needs the extra ``lpips``. Images [H, W, 3] in [0, 1]; outside ``mask`` [H, W] both are 0.
+    Needs the extra ``lpips``. Images [H, W, 3] in [0, 1], which the network sees in [−1, 1]; outside ``mask``
+    [H, W] both are 0.
     """
     import torch
 
@@ -78,4 +86,4 @@ def lpips_map(reference: np.ndarray, image: np.ndarray, mask: np.ndarray) -> np.
         return torch.from_numpy(masked).permute(2, 0, 1)[None] * 2 - 1
 
     with torch.inference_mode():
-        return _lpips_network()(prepared(reference), prepared(image))[0, 0].numpy()
+        return _lpips_network(network)(prepared(reference), prepared(image))[0, 0].numpy()
