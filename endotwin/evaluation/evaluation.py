@@ -25,7 +25,6 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from endotwin.align.photos import photo_of, well_inside
@@ -37,6 +36,7 @@ from endotwin.evaluation.highlights import Alike
 from endotwin.evaluation.kept import keep_scores
 from endotwin.evaluation.metrics import LPIPS_NETWORKS
 from endotwin.evaluation.renders import read_render, rendered_files
+from endotwin.evaluation.sheet import sheet_row
 from endotwin.light import shading
 from endotwin.render import Renderer
 from endotwin.run.output import check_picture
@@ -51,9 +51,6 @@ logger = logging.getLogger("endotwin")
 
 Progress = Callable[[str, int, int], None]
 
-SHEET_WIDTH = 320
-"""Width in pixels of one picture of the contact sheet."""
-
 MID_TONES = (0.1, 0.9)
 """Display values that are neither noise nor clipped."""
 
@@ -67,9 +64,6 @@ MEANS = (
     *HALVES,
 )
 """Scores of which a twin keeps the mean."""
-
-ERROR_FULL_SCALE = 0.25
-"""Absolute display-value error that the contact sheet draws in its brightest colour."""
 
 
 @dataclass(frozen=True)
@@ -390,7 +384,9 @@ def evaluate(
         if scene is not None:
             scores[-1] = replace(scores[-1], **_halved(held_out, sequence, scene, show))
         if sheet is not None:
-            rows.append(_sheet_row(held_out, scores[-1]))
+            score, name = scores[-1], held_out.frame.name
+            pictures = held_out.photo, held_out.render, held_out.valid
+            rows.append(sheet_row(name, *pictures, score.psnr, score.recall))
     if not scores:
         raise TwinError(
             f"{sequence.path} has no held-out frame to score; fuse a sequence of two or more frames"
@@ -408,13 +404,6 @@ def evaluate(
     if folder is not None:
         keep_scores(evaluation.to_dict(), twin, Path(folder))
     return evaluation
-
-
-def error_heat(photo: np.ndarray, render: np.ndarray, valid: np.ndarray) -> np.ndarray:
-    """Mean absolute error of two pictures [H, W, 3] in [0, 1], where ``valid`` [H, W], as a picture: uint8
-    [H, W, 3], RGB, black to bright for 0 to ERROR_FULL_SCALE."""
-    error = np.abs(photo - render).mean(axis=-1) / ERROR_FULL_SCALE * valid
-    return cv2.cvtColor(cv2.applyColorMap(_eight_bit(error), cv2.COLORMAP_INFERNO), cv2.COLOR_BGR2RGB)
 
 
 def _to_be_scored(
@@ -438,27 +427,3 @@ def _to_be_scored(
             f"{sequence.path} is the twin's own sequence; leave --sequence out, or name another"
         )
     return sequence, list(range(len(sequence)))
-
-
-def _sheet_row(held_out: _HeldOut, score: FrameScore) -> np.ndarray:
-    """Photo, render and error side by side, uint8 [h, 3·SHEET_WIDTH, 3], RGB."""
-    found = f", highlights {score.recall:.0%}" if math.isfinite(score.recall) else ""
-    pictures = {
-        f"photo {held_out.frame.name}": held_out.frame.color,
-        f"render, {score.psnr:.1f} dB{found}": _eight_bit(held_out.render),
-        f"error, 0 to {ERROR_FULL_SCALE:g}": error_heat(held_out.photo, held_out.render, held_out.valid),
-    }
-    return np.hstack([_labelled(picture, label) for label, picture in pictures.items()])
-
-
-def _eight_bit(values: np.ndarray) -> np.ndarray:
-    return np.uint8(np.clip(values, 0, 1) * 255 + 0.5)
-
-
-def _labelled(picture: np.ndarray, label: str) -> np.ndarray:
-    height = round(SHEET_WIDTH * picture.shape[0] / picture.shape[1])
-    small = cv2.resize(picture, (SHEET_WIDTH, height), interpolation=cv2.INTER_AREA)
-    for offset, color in ((1, (0, 0, 0)), (0, (255, 255, 255))):
-        corner = (6 + offset, height - 8 + offset)
-        cv2.putText(small, label, corner, cv2.FONT_HERSHEY_SIMPLEX, 0.42, color, 1, cv2.LINE_AA)
-    return small
