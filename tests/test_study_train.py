@@ -1,4 +1,4 @@
-"""Training: losses in closed form, equal shares of each pool, and a stopped run that goes on."""
+"""Training: losses in closed form, pools as one set, and a stopped run that goes on."""
 
 import math
 
@@ -43,13 +43,13 @@ def test_silog_of_a_common_factor_is_its_logarithm_by_root_two():
     assert silog(depth_mm, depth_mm).item() == pytest.approx(0, abs=1e-5)
 
 
-def test_each_pool_gives_as_many_photos():
-    pools = [frames(3, color=60, depth_mm=20), frames(50, color=180, depth_mm=60)]
-    course = Course(steps=1, batch=8, rate=1e-3, loss="huber", seed=0)
+def test_each_frame_of_all_pools_is_as_likely():
+    pools = [frames(5, color=60, depth_mm=20), frames(15, color=180, depth_mm=60)]
+    course = Course(steps=1, batch=400, rate=1e-3, loss="huber", seed=0)
     color, depth_mm = batch(pools, course, step=0)
-    assert color.shape == (8, 3, 32, 40) and depth_mm.shape == (8, 32, 40)
+    assert color.shape == (400, 3, 32, 40) and depth_mm.shape == (400, 32, 40)
     bright = color.mean(dim=(1, 2, 3)) > 0.45
-    assert bright.sum() == 4
+    assert bright.sum() == pytest.approx(300, abs=3 * (400 * 0.25 * 0.75) ** 0.5)
     assert (torch.nanmean(depth_mm[bright]) > 50) and (torch.nanmean(depth_mm[~bright]) < 30)
 
 

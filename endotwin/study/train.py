@@ -58,7 +58,7 @@ def train(
     progress: Callable[[int], None],
     device: torch.device,
 ) -> nn.Module:
-    """Train ``network`` on frames that come from each of ``pools`` in equal number, flipped at random.
+    """Train ``network`` on the frames of all ``pools`` as one set, flipped at random.
 
     Batches depend on seed and step alone, so that a run that goes on from ``checkpoint`` ends with the same
     weights.
@@ -113,10 +113,10 @@ def _resumed(network: nn.Module, optimizer: torch.optim.Optimizer, checkpoint: P
 def batch(pools: list[Frames], course: Course, step: int) -> tuple[torch.Tensor, torch.Tensor]:
     """Photos [B, 3, H, W] in [0, 1] and depth [B, H, W] in mm of one step."""
     generator = np.random.default_rng([course.seed, step])
+    frames = [(pool, index) for pool in pools for index in range(len(pool))]
     colors, depths = [], []
-    for place in range(course.batch):
-        pool = pools[(place + step) % len(pools)]
-        index = int(generator.integers(len(pool)))
+    for _ in range(course.batch):
+        pool, index = frames[generator.integers(len(frames))]
         across, down = (slice(None, None, -1 if flip else 1) for flip in generator.random(2) < 0.5)
         color, depth_mm = pool[index]
         colors.append(color[down, across])
