@@ -184,7 +184,7 @@ class Motion:
             return np.inf
         then_mm = np.linalg.norm(Carried(self.line, places[near], points[near]).moved(shift, M) - now, axis=1)
         nearer_mm = max((rest_mm[near] - then_mm).max(), 0.0) + SLACK_MM
-        asked = self._tree.query_ball_point(before, then_mm.min() + nearer_mm)
+        asked = np.array(self._tree.query_ball_point(before, then_mm.min() + nearer_mm))
         wall = Carried(self.line, self.places[asked], self.rest.vertices_mm[asked]).moved(shift, M)
         return float(np.linalg.norm(wall - now, axis=1).min())
 
