@@ -12,7 +12,6 @@ from endotwin.effects.video import Clip
 from endotwin.errors import OptionError
 from endotwin.light.incidence import to_camera
 from endotwin.render import Renderer, View
-from endotwin.render.renderer import laid_out
 from endotwin.run.streams import Stream
 from endotwin.surface import Surface
 from endotwin.synth.job import Job
@@ -190,7 +189,7 @@ class _Geometry:
 
     def _image(self, values: np.ndarray, empty: float = 0.0) -> np.ndarray:
         shape = (self._job.camera.height, self._job.camera.width)
-        return laid_out(values, self._hits.pixel, shape, empty)
+        return self._hits.laid_out(values, shape, empty)
 
     def _material(self, name: str) -> np.ndarray:
         if self._view:
