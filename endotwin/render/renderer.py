@@ -187,11 +187,12 @@ class Renderer:
         met = like._met if like else self._met(light, T_world_camera, mask, hits)
         radiance = met.centres.hits.laid_out(met.centres.radiance(light), shape)
         mean, count = met.mean_radiance(light)
-        radiance[met.edges] = np.where(count[:, None] > 0, mean, radiance[met.edges])
+        at = np.nonzero(met.edges)
+        radiance[at] = np.where(count[:, None] > 0, mean, radiance[at])
         told = met.told.copy()
-        told[met.edges] |= count > 0
-        dark = met.edges.copy()
-        dark[met.edges] = ~radiance[met.edges].any(axis=1)
+        told[at] |= count > 0
+        dark = np.zeros_like(told)
+        dark[at] = ~radiance[at].any(axis=1)
         told &= ~_alone(dark)
         _close_slits(radiance, told, met.edges)
         if "sparkle" in self.twin.effects:

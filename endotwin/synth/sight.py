@@ -11,7 +11,7 @@ import numpy as np
 from endotwin.cameras import Camera
 from endotwin.surface import Surface
 from endotwin.surface.casting import Caster, Correspondences
-from endotwin.surface.vectors import dot
+from endotwin.surface.vectors import dot, shifted
 from endotwin.synth.motion import Motion
 from endotwin.synth.trajectories import Trajectory
 
@@ -63,9 +63,7 @@ class Sight:
     @cached_property
     def _vertices(self) -> np.ndarray:
         """From the camera to the vertices, mm, float32 [V, 3]."""
-        centre = self.T_world_camera[:3, 3] - self.surface.origin_mm
-        towards = np.empty_like(self.surface.vertices_mm)
-        return np.subtract(self.surface.vertices_mm, centre, out=towards, casting="same_kind")
+        return shifted(self.surface.vertices_mm, self.surface.origin_mm - self.T_world_camera[:3, 3])
 
     def places(self, towards: np.ndarray) -> np.ndarray:
         """Where points [N, 3], as ``towards`` gives them, lie in the picture, px, float64 [N, 2]; NaN where
