@@ -12,11 +12,11 @@ from itertools import pairwise
 import numpy as np
 import torch
 from embreex import rtcore, rtcore_scene
-from embreex.mesh_construction import TriangleMesh
 from torch.nn.functional import embedding_bag
 
 from endotwin.cameras.base import Camera
 from endotwin.run.threads import THREADS
+from endotwin.surface import embree
 from endotwin.surface.packets import Packets
 from endotwin.surface.refit import Refit
 from endotwin.surface.surface import Surface
@@ -106,7 +106,7 @@ class Caster:
         self._threads = threads
         self._device = rtcore.EmbreeDevice()
         self._scene = rtcore_scene.EmbreeScene(self._device, robust=True)
-        self._mesh = TriangleMesh(self._scene, surface.vertices_mm, surface.triangles)
+        self._mesh = embree.mesh(self._scene, self._device, surface.vertices_mm, surface.triangles)
         self._refit: Refit | None = None
 
     def threaded(self, threads: int) -> Caster:
