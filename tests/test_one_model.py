@@ -20,7 +20,7 @@ from endotwin.fit.lighting import Relighting, lit
 from endotwin.fit.model import Globals, at_pixels, predict
 from endotwin.light.guides import visible_from
 from endotwin.render import Renderer
-from endotwin.render.renderer import laid_out, shadow_edges
+from endotwin.render.renderer import shadow_edges
 from endotwin.surface.casting import Caster
 from endotwin.surface.silhouettes import discontinuities
 from endotwin.twin import Twin
@@ -94,7 +94,7 @@ def averaged(view, renderer: Renderer, pose: np.ndarray) -> np.ndarray:
         points_mm = directions[view.hits.pixel] * view.hits.distance_mm[:, None]
         T_local_camera = renderer.twin.surface.to_local(pose)
         seen = visible_from(renderer.caster, T_local_camera, points_mm, np.array(effects.guides_mm))
-        edges |= shadow_edges(laid_out(seen, view.hits.pixel, view.shape))
+        edges |= shadow_edges(view.image(seen))
     return edges
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from endotwin.cameras.base import Camera
 from endotwin.surface import Surface
 from endotwin.surface.casting import Correspondences
-from endotwin.surface.vectors import dot, unit
+from endotwin.surface.vectors import dot, scaled, unit
 
 COS_MIN = 1e-4
 """Least cosine kept: a surface seen at 89.994° reflects nothing that an 8-bit photo shows, and logarithms
@@ -54,7 +54,7 @@ def incidence_on(normals: np.ndarray, hits: Correspondences, directions: np.ndar
     view = directions.reshape(-1, 3).take(hits.pixel, axis=0)
     cos = -dot(normals, view)
     # |n × ω|² = |n − cos·ω|² with ω = −view, without the cancellation of 1 − cos².
-    tangential = normals + cos[:, None] * view
+    tangential = normals + scaled(view, cos)
     return Incidence(
         cos=np.maximum(cos, COS_MIN),
         sin2=dot(tangential, tangential),

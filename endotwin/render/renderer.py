@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import pairwise
 from pathlib import Path
 
 import cv2
@@ -33,9 +32,6 @@ SUBPIXELS = 2
 FACING = 0.05
 """Least cosine between normal and ray of a surface that shows its colour. At the rim of a fold less of it
 than a hundredth of a pixel is steeper: what is there in a mesh is the back of a sliver, a black dot."""
-
-RUN_PX = 64
-"""Pixels in a row that are sooner copied at once than one by one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +61,7 @@ class View:
 
     def image(self, values: np.ndarray, empty: float = 0.0) -> np.ndarray:
         """Values of the hits, [N, ...], as an image [H, W, ...] with ``empty`` where no surface is seen."""
-        return laid_out(values, self.hits.pixel, self.shape, empty)
+        return self.hits.laid_out(values, self.shape, empty)
 
     @cached_property
     def mask(self) -> np.ndarray:
@@ -96,18 +92,6 @@ class View:
     def attribute(self, per_vertex: np.ndarray) -> np.ndarray:
         """A vertex attribute [V, ...] interpolated at the hits, [N, ...]."""
         return self.hits.interpolate(self._renderer.twin.surface, per_vertex)
-
-
-def laid_out(values: np.ndarray, pixel: np.ndarray, shape: tuple[int, int], empty: float = 0.0) -> np.ndarray:
-    """Values [N, ...] of row-major pixels [N] as an image [H, W, ...] with ``empty`` elsewhere."""
-    image = np.full((shape[0] * shape[1], *values.shape[1:]), empty, values.dtype)
-    gaps = np.flatnonzero(pixel[1:] != pixel[:-1] + 1) + 1
-    if (len(gaps) + 1) * RUN_PX > len(pixel):
-        image[pixel] = values
-    else:
-        for start, end in pairwise((0, *gaps.tolist(), len(pixel))):
-            image[pixel[start] : pixel[start] + end - start] = values[start:end]
-    return image.reshape(*shape, *values.shape[1:])
 
 
 class Renderer:
@@ -201,17 +185,18 @@ class Renderer:
             raise OptionError(f"the mask has the shape {np.shape(mask)}, but the image {shape}")
         light = self._illumination.at(T_world_camera)
         met = like._met if like else self._met(light, T_world_camera, mask, hits)
-        radiance = laid_out(met.centres.radiance(light), met.centres.hits.pixel, shape)
+        radiance = met.centres.hits.laid_out(met.centres.radiance(light), shape)
         mean, count = met.mean_radiance(light)
-        radiance[met.edges] = np.where(count[:, None] > 0, mean, radiance[met.edges])
+        at = np.nonzero(met.edges)
+        radiance[at] = np.where(count[:, None] > 0, mean, radiance[at])
         told = met.told.copy()
-        told[met.edges] |= count > 0
-        dark = met.edges.copy()
-        dark[met.edges] = ~radiance[met.edges].any(axis=1)
+        told[at] |= count > 0
+        dark = np.zeros_like(told)
+        dark[at] = ~radiance[at].any(axis=1)
         told &= ~_alone(dark)
         _close_slits(radiance, told, met.edges)
         if "sparkle" in self.twin.effects:
-            distance_mm = laid_out(met.centres.hits.distance_mm, met.centres.hits.pixel, shape)
+            distance_mm = met.centres.hits.laid_out(met.centres.hits.distance_mm, shape)
             radiance += sparkles(light, self._rough_mm2, self.camera, distance_mm)[..., None]
         radiance *= self._exposure * exposure
         if self._transmission is not None:
@@ -250,12 +235,12 @@ class Renderer:
         if hits is None:
             hits = self.caster.cast(self.camera, T_world_camera, mask)
         centres = self._points(self.camera, hits, light, T_world_camera)
-        pixel = centres.hits.pixel
-        distance_mm = laid_out(centres.hits.distance_mm, pixel, shape)
-        told = laid_out(centres.facing, pixel, shape)
+        laid_out = centres.hits.laid_out
+        distance_mm = laid_out(centres.hits.distance_mm, shape)
+        told = laid_out(centres.facing, shape)
         edges = discontinuities(distance_mm) | ((distance_mm > 0) & ~told)
         if centres.visible is not None:
-            edges |= shadow_edges(laid_out(centres.visible, pixel, shape))
+            edges |= shadow_edges(laid_out(centres.visible, shape))
         edges &= self._sees if mask is None else mask
         inside = (np.arange(SUBPIXELS) + 0.5) / SUBPIXELS - 0.5
         offsets = np.stack(np.meshgrid(inside, inside), axis=-1).reshape(-1, 2)
@@ -316,9 +301,9 @@ class _Met:
         """Radiance float32 [E, 3] of the edges, averaged over the rays that meet a surface which faces them,
         and how many do, [E]."""
         facing, edges, inside = self.within.facing, np.count_nonzero(self.edges), SUBPIXELS**2
-        pixel = self.within.hits.pixel[facing]
-        total = laid_out(self.within.radiance(light)[facing], pixel, (edges, inside)).sum(axis=1)
-        count = np.bincount(pixel // inside, minlength=edges).astype(np.float32)
+        seen = np.where(facing[:, None], self.within.radiance(light), 0)
+        total = self.within.hits.laid_out(seen, (edges, inside)).sum(axis=1)
+        count = np.bincount(self.within.hits.pixel[facing] // inside, minlength=edges).astype(np.float32)
         return total / np.maximum(count, 1)[:, None], count
 
 

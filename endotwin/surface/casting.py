@@ -7,21 +7,25 @@ from concurrent.futures import ThreadPoolExecutor
 from copy import copy
 from dataclasses import dataclass, fields
 from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 import torch
 from embreex import rtcore, rtcore_scene
-from embreex.mesh_construction import TriangleMesh
 from torch.nn.functional import embedding_bag
 
 from endotwin.cameras.base import Camera
 from endotwin.run.threads import THREADS
+from endotwin.surface import embree
 from endotwin.surface.packets import Packets
 from endotwin.surface.refit import Refit
 from endotwin.surface.surface import Surface
 
 RAYS_PER_TASK = 1 << 14
 """Rays of one task; with more, BLAS would rotate them on threads of its own, in each other's way."""
+
+RUN_PX = 64
+"""Pixels in a row that are sooner copied at once than one by one."""
 
 NUDGE = 1e-6 * np.array([0.36, 0.48, -0.8], np.float32)
 """A ray exactly through a shared vertex can slip between its triangles; one that misses is tried again this
@@ -50,6 +54,27 @@ class Correspondences:
     def __getitem__(self, index: np.ndarray) -> Correspondences:
         rows = np.flatnonzero(index) if index.dtype == bool else index
         return Correspondences(*(getattr(self, each.name).take(rows, axis=0) for each in fields(self)))
+
+    def laid_out(self, values: np.ndarray, shape: tuple[int, int], empty: float = 0.0) -> np.ndarray:
+        """Values of the hits, [N, ...], as an image [H, W, ...] of ``shape``, with ``empty`` elsewhere."""
+        image = np.full((shape[0] * shape[1], *values.shape[1:]), empty, values.dtype)
+        if self._runs is None:
+            image[self.pixel] = values
+        else:
+            for there, here in self._runs:
+                image[there] = values[here]
+        return image.reshape(*shape, *values.shape[1:])
+
+    @cached_property
+    def _runs(self) -> list[tuple[slice, slice]] | None:
+        """Pixels that follow each other, and which of the hits they are; None where most of them do not."""
+        gaps = np.flatnonzero(self.pixel[1:] != self.pixel[:-1] + 1) + 1
+        if (len(gaps) + 1) * RUN_PX > len(self):
+            return None
+        starts = (0, *gaps.tolist())
+        shifts = (self.pixel[list(starts)] - starts).tolist()
+        hits = pairwise((*starts, len(self)))
+        return [(slice(a + by, b + by), slice(a, b)) for (a, b), by in zip(hits, shifts, strict=True)]
 
     def interpolate(self, surface: Surface, per_vertex: np.ndarray) -> np.ndarray:
         """Barycentric interpolation of ``per_vertex`` [V, ...] at the hit points, [N, ...]."""
@@ -81,7 +106,7 @@ class Caster:
         self._threads = threads
         self._device = rtcore.EmbreeDevice()
         self._scene = rtcore_scene.EmbreeScene(self._device, robust=True)
-        self._mesh = TriangleMesh(self._scene, surface.vertices_mm, surface.triangles)
+        self._mesh = embree.mesh(self._scene, self._device, surface.vertices_mm, surface.triangles)
         self._refit: Refit | None = None
 
     def threaded(self, threads: int) -> Caster:

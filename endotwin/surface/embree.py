@@ -7,18 +7,28 @@ that lies about it is what must be there, there is no handle.
 from __future__ import annotations
 
 import ctypes
-from ctypes import c_int, c_uint, c_void_p, sizeof
+from ctypes import c_int, c_size_t, c_uint, c_void_p, sizeof
 from functools import cache
 from pathlib import Path
 
 import embreex
+import numpy as np
 from embreex import rtcore, rtcore_scene
+from embreex.mesh_construction import TriangleMesh
 
 SIGN = 0x5AFE
 """Written through embreex, and found again where it must lie."""
 
 PLACES = (".", "../embreex.libs", ".dylibs")
 """Where wheels put the libraries that they bring along."""
+
+FIRST = 0
+TRIANGLES, VERTICES = 0, 1
+UINT3, FLOAT3 = 0x5003, 0x9003
+"""Of Embree 4's rtcore_buffer.h."""
+
+FLOATS = 4
+"""Of a vertex in a buffer: x, y, z and one to fill it up."""
 
 FUNCTIONS = (
     ("rtcSetSceneFlags", c_void_p, c_int),
@@ -29,6 +39,7 @@ FUNCTIONS = (
     ("rtcCommitGeometry", c_void_p),
     ("rtcGetGeometry", c_void_p, c_uint),
     ("rtcGetGeometryBufferData", c_void_p, c_int, c_uint),
+    ("rtcSetNewGeometryBuffer", c_void_p, c_int, c_uint, c_int, c_size_t, c_size_t),
     ("rtcIntersect16", c_void_p, c_void_p, c_void_p, c_void_p),
     ("rtcOccluded16", c_void_p, c_void_p, c_void_p, c_void_p),
 )
@@ -47,6 +58,36 @@ def handle(scene: rtcore_scene.EmbreeScene, device: rtcore.EmbreeDevice) -> int 
     return c_void_p.from_address(id(scene) + head).value if is_known else None
 
 
+def mesh(
+    scene: rtcore_scene.EmbreeScene,
+    device: rtcore.EmbreeDevice,
+    vertices_mm: np.ndarray,
+    triangles: np.ndarray,
+) -> TriangleMesh:
+    """Vertices float32 [V, 3] and triangles int32 [F, 3] in a ``scene`` on its ``device``. The buffers are
+    filled here, where that can be: embreex takes half a microsecond a triangle for it."""
+    known = handle(scene, device)
+    if known is None or not len(triangles):
+        return TriangleMesh(scene, vertices_mm, triangles)
+    made = TriangleMesh(scene, vertices_mm[:1], triangles[:0])
+    geometry = c_void_p(loaded().rtcGetGeometry(known, FIRST))
+    for kind, form, dtype, width, rows in (
+        (VERTICES, FLOAT3, np.float32, FLOATS, vertices_mm),
+        (TRIANGLES, UINT3, np.uint32, 3, triangles),
+    ):
+        size = width * np.dtype(dtype).itemsize
+        start = loaded().rtcSetNewGeometryBuffer(geometry, kind, FIRST, form, size, len(rows))
+        buffer(start, len(rows), width, dtype)[:, :3] = rows
+    loaded().rtcCommitGeometry(geometry)
+    return made
+
+
+def buffer(start: int, rows: int, width: int, kind: np.dtype) -> np.ndarray:
+    """The array [rows, width] that begins at an address."""
+    memory = (ctypes.c_byte * (rows * width * np.dtype(kind).itemsize)).from_address(start)
+    return np.frombuffer(memory, kind).reshape(rows, width)
+
+
 @cache
 def loaded() -> ctypes.CDLL | None:
     """Embree 4 as embreex has loaded it; None where that is not found."""
@@ -56,7 +97,7 @@ def loaded() -> ctypes.CDLL | None:
         found = ctypes.CDLL(str(files[0]))
         for name, *takes in FUNCTIONS:
             function = getattr(found, name)
-            function.argtypes, function.restype = takes, c_void_p if "Get" in name else None
+            function.argtypes, function.restype = takes, c_void_p if "Get" in name or "New" in name else None
     except (IndexError, OSError, AttributeError):
         return None
     return found

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 from collections.abc import Iterator
 from ctypes import c_float, c_uint, c_void_p
+from itertools import repeat
 from typing import Self
 
 import numpy as np
@@ -124,8 +125,8 @@ class Packets:
         arguments = ctypes.addressof(self._arguments)
         masks = range(mask.ctypes.data, mask.ctypes.data + mask.nbytes, mask.strides[0])
         first, step = packets.ctypes.data, packets.strides[0]
-        for valid, packet in zip(masks, range(first, first + packets.nbytes, step), strict=True):
-            query(valid, self._handle, packet, arguments)
+        rays = range(first, first + packets.nbytes, step)
+        any(map(query, masks, repeat(self._handle), rays, repeat(arguments)))  # None of each: a loop in C
 
 
 def _packed(image: np.ndarray) -> np.ndarray:

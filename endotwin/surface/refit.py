@@ -11,13 +11,9 @@ from embreex import rtcore, rtcore_scene
 
 from endotwin.surface import embree
 
-VERTEX_BUFFER, FIRST = 1, 0
 LOW, REFIT = 0, 3
 DYNAMIC, ROBUST = 1, 4
-"""Of Embree 4's rtcore_buffer.h, rtcore_common.h and rtcore_scene.h."""
-
-FLOATS = 4
-"""Of a vertex in embreex's buffer: x, y, z and one to fill it up."""
+"""Of Embree 4's rtcore_common.h and rtcore_scene.h."""
 
 
 class Refit:
@@ -26,10 +22,9 @@ class Refit:
 
     def __init__(self, library: ctypes.CDLL, scene: rtcore_scene.EmbreeScene, handle: int, vertices: int):
         self._library, self._scene, self._handle = library, scene, c_void_p(handle)
-        self._geometry = c_void_p(library.rtcGetGeometry(self._handle, FIRST))
-        buffer = library.rtcGetGeometryBufferData(self._geometry, VERTEX_BUFFER, FIRST)
-        floats = (ctypes.c_float * (vertices * FLOATS)).from_address(buffer)
-        self._vertices_mm = np.frombuffer(floats, np.float32).reshape(vertices, FLOATS)[:, :3]
+        self._geometry = c_void_p(library.rtcGetGeometry(self._handle, embree.FIRST))
+        start = library.rtcGetGeometryBufferData(self._geometry, embree.VERTICES, embree.FIRST)
+        self._vertices_mm = embree.buffer(start, vertices, embree.FLOATS, np.float32)[:, :3]
         library.rtcSetSceneFlags(self._handle, DYNAMIC | ROBUST)
         library.rtcSetSceneBuildQuality(self._handle, LOW)
         library.rtcSetGeometryBuildQuality(self._geometry, LOW)
@@ -50,7 +45,7 @@ class Refit:
         self._commit()
 
     def _commit(self) -> None:
-        self._library.rtcUpdateGeometryBuffer(self._geometry, VERTEX_BUFFER, FIRST)
+        self._library.rtcUpdateGeometryBuffer(self._geometry, embree.VERTICES, embree.FIRST)
         self._library.rtcCommitGeometry(self._geometry)
         self._library.rtcCommitScene(self._handle)
         self._scene.is_committed = 1

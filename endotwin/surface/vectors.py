@@ -1,19 +1,38 @@
-"""Products and lengths of many vectors at once."""
+"""Sums, products and lengths of many vectors at once: by columns, since rows of three are slow."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import numpy as np
 
 
 def dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Products a·b, [...], of vectors [..., 3]; by columns, since sums over rows of three are slow."""
+    """Products a·b, [...], of vectors [..., 3]."""
     return a[..., 0] * b[..., 0] + a[..., 1] * b[..., 1] + a[..., 2] * b[..., 2]
+
+
+def shifted(vectors: np.ndarray, by: np.ndarray) -> np.ndarray:
+    """Vectors [..., 3] and ``by`` [3] together, of the vectors' precision, but added in the higher one."""
+    return _by_columns(np.add, vectors, by)
+
+
+def scaled(vectors: np.ndarray, factor: np.ndarray) -> np.ndarray:
+    """Vectors [..., 3], each times its ``factor`` [...]."""
+    return _by_columns(np.multiply, vectors, (factor,) * 3)
+
+
+def _by_columns(operation: np.ufunc, vectors: np.ndarray, others: Sequence) -> np.ndarray:
+    found = np.empty_like(vectors)
+    for k in range(3):
+        operation(vectors[..., k], others[k], out=found[..., k], casting="same_kind")
+    return found
 
 
 def unit(vectors: np.ndarray) -> np.ndarray:
     """Vectors [..., 3] scaled to unit length; a zero vector stays zero."""
-    norm = np.sqrt(dot(vectors, vectors))[..., None]
-    return vectors / np.maximum(norm, np.finfo(vectors.dtype).tiny)
+    norm = np.maximum(np.sqrt(dot(vectors, vectors)), np.finfo(vectors.dtype).tiny)
+    return _by_columns(np.divide, vectors, (norm,) * 3)
 
 
 def turned_along(vectors: np.ndarray, one: np.ndarray, other: np.ndarray) -> np.ndarray:

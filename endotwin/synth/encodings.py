@@ -249,7 +249,7 @@ ENCODINGS: dict[str, Encoding] = {
             ),
             (
                 ".npz",
-                lambda flow_px: npz(flow=flow_px.astype(np.float32)),
+                lambda flow_px: npz(flow=flow_px.astype(np.float32, copy=False)),
                 "NumPy, array flow [H, W, 2]",
                 lambda content: np.load(BytesIO(content))["flow"].astype(np.float64),
             ),
@@ -298,7 +298,7 @@ ENCODINGS: dict[str, Encoding] = {
     },
     "vertices": Encoding(
         ".npz",
-        lambda vertices_mm: npz(vertices_mm=vertices_mm.astype(np.float32)),
+        lambda vertices_mm: npz(vertices_mm=vertices_mm.astype(np.float32, copy=False)),
         "NumPy, array vertices_mm [V, 3], 32-bit float: the vertices of surface.ply (which has them at rest) "
         "in this frame, world, mm",
         lambda content: np.load(BytesIO(content))["vertices_mm"].astype(np.float64),

@@ -12,9 +12,9 @@ from endotwin.effects.video import Clip
 from endotwin.errors import OptionError
 from endotwin.light.incidence import to_camera
 from endotwin.render import Renderer, View
-from endotwin.render.renderer import laid_out
 from endotwin.run.streams import Stream
 from endotwin.surface import Surface
+from endotwin.surface.vectors import shifted
 from endotwin.synth.job import Job
 from endotwin.synth.photograph import photographed
 from endotwin.synth.sight import Sights
@@ -190,7 +190,7 @@ class _Geometry:
 
     def _image(self, values: np.ndarray, empty: float = 0.0) -> np.ndarray:
         shape = (self._job.camera.height, self._job.camera.width)
-        return laid_out(values, self._hits.pixel, shape, empty)
+        return self._hits.laid_out(values, shape, empty)
 
     def _material(self, name: str) -> np.ndarray:
         if self._view:
@@ -287,17 +287,24 @@ class _Geometry:
     @property
     def vertices(self) -> np.ndarray:
         surface = self._sight.surface
-        return surface.vertices_mm + surface.origin_mm
+        return shifted(surface.vertices_mm, surface.origin_mm)
 
     def _scene_flow(self, index: int) -> np.ndarray:
         if not self._exists(index):
             return self._image(np.full((len(self._hits), 3), np.nan, np.float32), np.nan)
         poses = self._job.trajectory.T_world_camera
         ridden_mm = (poses[index] - poses[self._index])[:3, 3].astype(np.float32)
-        return self._image(self._towards(index) - self._towards(self._index) + ridden_mm, np.nan)
+        moved_mm = self._towards(index) - self._towards(self._index)
+        return self._image(shifted(moved_mm, ridden_mm), np.nan)
 
     def _exists(self, index: int) -> bool:
         return 0 <= index < len(self._job.trajectory.T_world_camera)
+
+    @cached_property
+    def _uv(self) -> np.ndarray:
+        """Pixels of the hits, float64 [N, 2]."""
+        v, u = np.divmod(self._hits.pixel, self._job.camera.width)
+        return np.stack([u, v], axis=1).astype(np.float64)
 
     def _uv_at(self, index: int) -> np.ndarray:
         """Where the points of the hits lie in another frame's image, px, float64 [N, 2]."""
@@ -308,9 +315,7 @@ class _Geometry:
     def _flow(self, index: int) -> np.ndarray:
         if not self._exists(index):
             return self._image(np.full((len(self._hits), 2), np.nan, np.float32), np.nan)
-        v, u = np.divmod(self._hits.pixel, self._job.camera.width)
-        flow_px = self._uv_at(index) - np.stack([u, v], axis=1)
-        return self._image(flow_px.astype(np.float32), np.nan)
+        return self._image((self._uv_at(index) - self._uv).astype(np.float32), np.nan)
 
     def _hidden(self, index: int) -> np.ndarray:
         if not self._exists(index):

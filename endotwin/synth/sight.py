@@ -11,7 +11,7 @@ import numpy as np
 from endotwin.cameras import Camera
 from endotwin.surface import Surface
 from endotwin.surface.casting import Caster, Correspondences
-from endotwin.surface.vectors import dot
+from endotwin.surface.vectors import dot, shifted
 from endotwin.synth.motion import Motion
 from endotwin.synth.trajectories import Trajectory
 
@@ -58,8 +58,12 @@ class Sight:
     def towards(self, hits: Correspondences) -> np.ndarray:
         """From the camera to where the points of ``hits``, of any frame, are in this one, along the world's
         axes, mm, float32 [N, 3]: within 1e-7 of their length."""
-        centre = self.T_world_camera[:3, 3] - self.surface.origin_mm
-        return hits.interpolate(self.surface, (self.surface.vertices_mm - centre).astype(np.float32))
+        return hits.interpolate(self.surface, self._vertices)
+
+    @cached_property
+    def _vertices(self) -> np.ndarray:
+        """From the camera to the vertices, mm, float32 [V, 3]."""
+        return shifted(self.surface.vertices_mm, self.surface.origin_mm - self.T_world_camera[:3, 3])
 
     def places(self, towards: np.ndarray) -> np.ndarray:
         """Where points [N, 3], as ``towards`` gives them, lie in the picture, px, float64 [N, 2]; NaN where
@@ -92,8 +96,8 @@ class Sight:
     def _distances(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Distance at the pixels, float32 [H, W], NaN where no surface is; the least and the greatest of the
         ABOUT_PX² about the place between a pixel and the next ones to the right and down."""
-        distance_mm = np.full((self._camera.height, self._camera.width), np.nan, np.float32)
-        distance_mm.reshape(-1)[self.hits.pixel] = self.hits.distance_mm
+        shape = self._camera.height, self._camera.width
+        distance_mm = self.hits.laid_out(self.hits.distance_mm, shape, np.nan)
         about, anchor = np.ones((ABOUT_PX, ABOUT_PX), np.uint8), (ABOUT_PX // 2 - 1,) * 2
         none_is_far = np.where(np.isnan(distance_mm), np.float32(FAR_MM), distance_mm)
         nearest, farthest = (way(none_is_far, about, anchor=anchor) for way in (cv2.erode, cv2.dilate))

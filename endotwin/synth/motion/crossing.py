@@ -23,7 +23,11 @@ def crossings(surface: Surface) -> np.ndarray:
     length_mm = np.linalg.norm(towards, axis=1)
     long = length_mm > 0
     edges, start, towards, length_mm = edges[long], start[long], towards[long], length_mm[long]
-    hit, _, distance_mm = Caster(surface).cast_rays(start + ENDS * towards, unit(towards))
-    met = np.flatnonzero((hit >= 0) & (distance_mm < (1 - 2 * ENDS) * length_mm))
-    touching = (surface.triangles[hit[met]][:, :, None] == edges[met][:, None, :]).any(axis=(1, 2))
-    return np.unique(hit[met[~touching]])
+    caster, origins, directions = Caster(surface), start + ENDS * towards, unit(towards)
+    reach_mm = (1 - 2 * ENDS) * length_mm
+    met = np.flatnonzero(~caster.unobstructed(origins, directions, reach_mm))  # which few are, is soon told
+    hit, _, distance_mm = caster.cast_rays(origins[met], directions[met])
+    within = distance_mm < reach_mm[met]
+    hit, met = hit[within], met[within]
+    touching = (surface.triangles[hit][:, :, None] == edges[met][:, None, :]).any(axis=(1, 2))
+    return np.unique(hit[~touching])

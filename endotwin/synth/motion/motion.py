@@ -150,10 +150,11 @@ class Motion:
         return {field.name: getattr(self, field.name) for field in fields(self)}
 
     @cached_property
-    def _few(self) -> tuple[np.ndarray, Places]:
-        """FEW of the vertices at rest, [F, 3], and their places."""
+    def _few(self) -> tuple[np.ndarray, Carried]:
+        """FEW of the vertices at rest, [F, 3], and as the tissue takes them along."""
         chosen = slice(None, None, max(len(self.rest.vertices_mm) // FEW, 1))
-        return self.rest.vertices_mm[chosen], self.places[chosen]
+        points = self.rest.vertices_mm[chosen]
+        return points, Carried(self.line, self.places[chosen], points)
 
     def _ridden(self, T_world_camera: np.ndarray, time_s: float) -> tuple[np.ndarray, float]:
         """The pose [4, 4] where the lumen takes it, and how far it is then from the nearest vertex, mm."""
@@ -177,14 +178,14 @@ class Motion:
         Some vertices tell how far that is at most, and how much nearer tissue comes: what was farther away
         than both together is not the nearest.
         """
-        points, places = self._few
+        points, carried = self._few
         rest_mm = np.linalg.norm(points - before, axis=1)
         near = np.flatnonzero(rest_mm < NEAR * np.median(self.line.radius_mm))
         if not len(near):
             return np.inf
-        then_mm = np.linalg.norm(Carried(self.line, places[near], points[near]).moved(shift, M) - now, axis=1)
+        then_mm = np.linalg.norm(carried.moved(shift, M)[near] - now, axis=1)
         nearer_mm = max((rest_mm[near] - then_mm).max(), 0.0) + SLACK_MM
-        asked = self._tree.query_ball_point(before, then_mm.min() + nearer_mm)
+        asked = np.array(self._tree.query_ball_point(before, then_mm.min() + nearer_mm))
         wall = Carried(self.line, self.places[asked], self.rest.vertices_mm[asked]).moved(shift, M)
         return float(np.linalg.norm(wall - now, axis=1).min())
 

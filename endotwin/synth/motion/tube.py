@@ -19,7 +19,7 @@ from torch.nn.functional import embedding_bag
 
 from endotwin.surface import Surface
 from endotwin.surface.rows import Rows
-from endotwin.surface.vectors import dot, unit
+from endotwin.surface.vectors import dot, scaled, unit
 from endotwin.synth.trajectories.centerline import Centerline, arc_length, lengthened
 
 SPACING_MM = 0.5
@@ -152,7 +152,7 @@ class Carried:
         w, rows = self._across(_stacked(rates[0] - own, rates[1])), M.transpose(0, 2, 1)
         normals, slope = self._along(rows), self._slope(rows)
         space = self._places.of_table((M[:, 0] ** 2).sum(axis=1).astype(np.float32)) + dot(slope, w)
-        return unit(normals - slope * (dot(w, normals) / space)[:, None]), space
+        return unit(normals - scaled(slope, dot(w, normals) / space)), space
 
 
 def _stacked(u: np.ndarray, M: np.ndarray) -> np.ndarray:

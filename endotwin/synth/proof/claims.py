@@ -132,7 +132,7 @@ class Tally:
         for name, errors in judged:
             self._pixels[name] += len(errors)
             self._beyond[name] += int((errors > CLAIMS[name].limit).sum())
-            self._kept[name].append(np.sort(errors)[:: max(len(errors) // KEPT, 1)])
+            self._kept[name].append(np.sort(errors.astype(np.float32))[:: max(len(errors) // KEPT, 1)])
 
     def proof(self, frames: int, pairs: int) -> Proof:
         """What was found, in the order of ``CLAIMS``; claims on no pixel are left out."""

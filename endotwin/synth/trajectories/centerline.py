@@ -142,7 +142,7 @@ def _rough_line(lumen: Lumen, covered: np.ndarray) -> np.ndarray | None:
     points = starts[chord] + 0.5 * distance_mm[chord, None] * inward[chord]
     if len(points) < NEIGHBOURS + 1:
         return None
-    clearance = cKDTree(surface.vertices_mm).query(points)[0]
+    clearance = cKDTree(surface.vertices_mm).query(points, workers=-1)[0]
     cells = np.floor(points / (0.1 * np.median(clearance))).astype(np.int64)
     one_a_cell = np.unique(cells, axis=0, return_index=True)[1]
     wide = one_a_cell[clearance[one_a_cell] > 0.5 * np.median(clearance)]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -56,13 +57,16 @@ class Lumen:
 
     def __init__(self, surface: Surface):
         self.surface = surface
-        self._caster = Caster(surface)
         a, b, c = (surface.vertices_mm[surface.triangles[:, k]] for k in range(3))
         self._facing = unit(np.cross(b - a, c - a))
         self._sphere = fibonacci_sphere(SPHERE_RAYS)
         corners = surface.triangles
         self._filled = surface.filled[corners].any(axis=1)
         self._unseen = (surface.seen_by == 0)[corners].any(axis=1) & ~self._filled & surface.seen_by.any()
+
+    @cached_property
+    def _caster(self) -> Caster:
+        return Caster(self.surface)
 
     def probe(self, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """First hits of rays in the surface's local frame.
