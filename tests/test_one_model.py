@@ -18,11 +18,8 @@ from endotwin.effects.vignetting import Vignetting
 from endotwin.fit.gauss_newton import GaussNewton
 from endotwin.fit.lighting import Relighting, lit
 from endotwin.fit.model import Globals, at_pixels, predict
-from endotwin.light.guides import visible_from
 from endotwin.render import Renderer
-from endotwin.render.renderer import shadow_edges
 from endotwin.surface.casting import Caster
-from endotwin.surface.silhouettes import discontinuities
 from endotwin.twin import Twin
 
 GUIDES = Offset(((3.2, 0.5, 0.0), (-2.8, 2.7, 0.0)))
@@ -75,27 +72,13 @@ def test_the_renderers_pixels_are_what_the_fit_predicts(tube, scene):
         view = renderer.view(pose, exposure=gain)
         rows = np.flatnonzero(samples.frame.numpy() == frame)
         pixel = samples.pixel.numpy()[rows]
-        inner = ~averaged(view, renderer, pose).ravel()[pixel]
+        inner = ~view.averaged.ravel()[pixel]
         apart = np.abs(view.color.reshape(-1, 3)[pixel] - predicted[rows])[inner]
         compared += len(apart)
         # Of bounced light the fit has the nearest vertex's, and the renderer what lies between three.
         assert np.quantile(apart, 0.999 if effects.bounce else 1.0) < LEVEL
         assert np.median(apart) < 0.1 * LEVEL
     assert compared > 0.75 * len(samples)
-
-
-def averaged(view, renderer: Renderer, pose: np.ndarray) -> np.ndarray:
-    """Bool [H, W]: pixels that the renderer shows as means of several rays, where the fit has one."""
-    distance_mm = view.image(view.hits.distance_mm)
-    edges = discontinuities(distance_mm)
-    effects = renderer.twin.effects
-    if "shadows" in effects:
-        directions = renderer.camera.pixel_directions.reshape(-1, 3)
-        points_mm = directions[view.hits.pixel] * view.hits.distance_mm[:, None]
-        T_local_camera = renderer.twin.surface.to_local(pose)
-        seen = visible_from(renderer.caster, T_local_camera, points_mm, np.array(effects.guides_mm))
-        edges |= shadow_edges(view.image(seen))
-    return edges
 
 
 @pytest.mark.parametrize("scene", [name for name in SCENES if name not in ("light", "gain")])

@@ -1,10 +1,16 @@
 """Rendered views against closed forms: a sphere seen from inside, a plane seen head-on."""
 
+from dataclasses import replace
+
+import cv2
 import numpy as np
 import pytest
 import trimesh
 from scenes import look, pinhole
 
+from endotwin.effects import Effects
+from endotwin.effects.coat import Coat
+from endotwin.effects.specular import Specular
 from endotwin.errors import TwinError
 from endotwin.render import Renderer
 from endotwin.surface import Surface
@@ -196,6 +202,17 @@ def test_twice_the_light_is_twice_the_radiance(sphere):
     two = Renderer(twin_of(sphere, L0=16.0)).view(at_centre()).color
     assert two.max() < 1
     np.testing.assert_allclose((two / one) ** (1 / GAMMA), 2, rtol=0.02)
+
+
+def test_a_highlight_sharper_than_a_pixel_is_the_mean_over_its_area(plane):
+    twin = replace(twin_of(plane, L0=0.2 * LIGHT.L0), effects=Effects([Specular(), Coat(0.2, 0.1)]))
+    view, fine = (Renderer(twin, CAMERA.scaled(factor)).view(at_centre()) for factor in (1, 15))
+    inside = cv2.erode(view.mask.astype(np.uint8), np.ones((3, 3))) > 0
+    areas = fine.radiance.reshape(CAMERA.height, 15, CAMERA.width, 15, 3).mean(axis=(1, 3))
+    mean, centre = (values[inside] ** GAMMA for values in (areas, fine.radiance[7::15, 7::15]))
+    assert np.abs(view.color[inside] - mean).max() < 2 / 255
+    assert np.abs(centre - mean).max() > 8 / 255
+    assert 0 < view.averaged[inside].mean() < 0.05
 
 
 def test_another_camera_sees_the_same_surface(plane):

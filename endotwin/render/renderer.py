@@ -27,7 +27,10 @@ from endotwin.surface.vectors import dot, turned_along
 from endotwin.twin import Twin, as_twin
 
 SUBPIXELS = 2
-"""A pixel at a silhouette or a shadow's edge is the mean of SUBPIXELS² rays."""
+"""A pixel at a silhouette, a shadow's edge or a sharp highlight is the mean of SUBPIXELS² rays."""
+
+BENT = 0.5 / 255
+"""A pixel whose mean differs from its centre by more, as displayed, is where a highlight is sharp."""
 
 FACING = 0.05
 """Least cosine between normal and ray of a surface that shows its colour. At the rim of a fold less of it
@@ -67,6 +70,11 @@ class View:
     def mask(self) -> np.ndarray:
         """Bool [H, W]: pixels that see the surface."""
         return self.image(np.ones(len(self.hits), bool), False)
+
+    @property
+    def averaged(self) -> np.ndarray:
+        """Bool [H, W]: pixels whose colour is a mean over their area."""
+        return self._met.edges
 
     @cached_property
     def depth_mm(self) -> np.ndarray:
@@ -170,11 +178,11 @@ class Renderer:
     ) -> View:
         """The view from ``T_world_camera`` [4, 4], of the pixels in ``mask`` [H, W] if given.
 
-        Colours of pixels at silhouettes and shadow edges (and of those beside the mask's edge), and only
-        those, are means over the pixel's area; labels are of its centre. ``exposure`` is a factor on the
-        radiance of this view. ``like`` is a view from there by a renderer of the same twin with other lobes,
-        through the same camera: what its rays met, and how that is lit, is not looked for again. ``hits`` are
-        what the rays through the pixels' centres meet, if that is known.
+        Colours of pixels at silhouettes, shadow edges and sharp highlights (and of those beside the mask's
+        edge), and only those, are means over the pixel's area; labels are of its centre. ``exposure`` is a
+        factor on the radiance of this view. ``like`` is a view from there by a renderer of the same twin with
+        other lobes, through the same camera: what its rays met, and how that is lit, is not looked for again.
+        ``hits`` are what the rays through the pixels' centres meet, if that is known.
 
         Raises:
             TrajectoryError: that is no rigid pose. OptionError: the mask has another shape than the image.
@@ -184,8 +192,10 @@ class Renderer:
         if mask is not None and np.shape(mask) != shape:
             raise OptionError(f"the mask has the shape {np.shape(mask)}, but the image {shape}")
         light = self._illumination.at(T_world_camera)
-        met = like._met if like else self._met(light, T_world_camera, mask, hits)
-        radiance = met.centres.hits.laid_out(met.centres.radiance(light), shape)
+        if like:
+            met, radiance = like._met, like._met.centres.image(light, shape)
+        else:
+            met, radiance = self._met(light, T_world_camera, mask, hits, exposure)
         mean, count = met.mean_radiance(light)
         at = np.nonzero(met.edges)
         radiance[at] = np.where(count[:, None] > 0, mean, radiance[at])
@@ -198,10 +208,8 @@ class Renderer:
         if "sparkle" in self.twin.effects:
             distance_mm = met.centres.hits.laid_out(met.centres.hits.distance_mm, shape)
             radiance += sparkles(light, self._rough_mm2, self.camera, distance_mm)[..., None]
-        radiance *= self._exposure * exposure
-        if self._transmission is not None:
-            radiance *= self._transmission
-        color = shading.respond(torch.from_numpy(radiance), self.twin.response.gamma).clamp(0, 1).numpy()
+        radiance, shown = self._shown(radiance, exposure)
+        color = shown.clip(0, 1, out=shown)
         return View(color, radiance, met.centres.hits, shape, self, met)
 
     @property
@@ -229,8 +237,9 @@ class Renderer:
         T_world_camera: np.ndarray,
         mask: np.ndarray | None,
         hits: Correspondences | None,
-    ) -> _Met:
-        """What the rays of a view meet."""
+        exposure: float,
+    ) -> tuple[_Met, np.ndarray]:
+        """What the rays of a view meet, and the radiance of its centres, [H, W, 3]."""
         shape = (self.camera.height, self.camera.width)
         if hits is None:
             hits = self.caster.cast(self.camera, T_world_camera, mask)
@@ -241,13 +250,22 @@ class Renderer:
         edges = discontinuities(distance_mm) | ((distance_mm > 0) & ~told)
         if centres.visible is not None:
             edges |= shadow_edges(laid_out(centres.visible, shape))
+        radiance = centres.image(light, shape)
+        edges |= bent(self._shown(radiance, exposure)[1])
         edges &= self._sees if mask is None else mask
         inside = (np.arange(SUBPIXELS) + 0.5) / SUBPIXELS - 0.5
         offsets = np.stack(np.meshgrid(inside, inside), axis=-1).reshape(-1, 2)
         uv = np.argwhere(edges)[:, ::-1]
         rays = Rays(self.camera.directions(uv[:, None] + offsets).astype(np.float32))
         within = self._points(rays, self.caster.cast(rays, T_world_camera), light, T_world_camera)
-        return _Met(centres, told, edges, within)
+        return _Met(centres, told, edges, within), radiance
+
+    def _shown(self, radiance: np.ndarray, exposure: float) -> tuple[np.ndarray, np.ndarray]:
+        """``radiance`` [H, W, 3] as it comes to the sensor, and as it is displayed where nothing clips."""
+        radiance = radiance * (self._exposure * np.float32(exposure))
+        if self._transmission is not None:
+            radiance *= self._transmission
+        return radiance, shading.respond(torch.from_numpy(radiance), self.twin.response.gamma).numpy()
 
     def _points(
         self, rays: Camera | Rays, hits: Correspondences, light: ViewLight, T_world_camera: np.ndarray
@@ -280,6 +298,10 @@ class _Points:
     def radiance(self, light: ViewLight) -> np.ndarray:
         """Float32 [N, 3]."""
         return light.radiance(self.hits, self.lit, self.material).numpy()
+
+    def image(self, light: ViewLight, shape: tuple[int, int]) -> np.ndarray:
+        """Their radiance [H, W, 3], where they are those of pixels; 0 where no surface is met."""
+        return self.hits.laid_out(self.radiance(light), shape)
 
 
 @dataclass(frozen=True, eq=False)
@@ -336,6 +358,14 @@ def _close_slits(radiance: np.ndarray, told: np.ndarray, edges: np.ndarray) -> N
     weight = told[rows, columns].astype(np.float32)
     total = (radiance[rows, columns] * weight[..., None]).sum(axis=0)
     radiance[row, column] = total / np.maximum(weight.sum(axis=0), 1)[:, None]
+
+
+def bent(shown: np.ndarray) -> np.ndarray:
+    """Bool [H, W]: pixels whose mean is not the value of their centre, by the curvature of ``shown`` [H, W,
+    3], in display values: a 24th of the Laplacian, for a parabola. Where all is white that does not show."""
+    gray = shown.mean(axis=2)
+    white = cv2.erode(gray, np.ones((3, 3), np.uint8)) > 1
+    return (np.abs(cv2.Laplacian(gray, -1)) > 24 * BENT) & ~white
 
 
 def shadow_edges(visible: np.ndarray) -> np.ndarray:
