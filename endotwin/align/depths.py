@@ -11,7 +11,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from endotwin import fusion
 from endotwin.align.corrections import Corrections, shared_spread
 from endotwin.align.motion import moved
 from endotwin.config import FuseConfig
@@ -103,6 +102,8 @@ def registered(
 
     Held-out frames whose depth the twin may not know follow the drift of the others.
     """
+    from endotwin import fusion  # with Open3D, which takes two seconds and is seldom needed here
+
     training = twin.source.training(len(sequence))
     heldout = twin.source.heldout(len(sequence)) if twin.source.geometry == "known" else []
     frames = np.array(sorted({*training, *heldout}))
