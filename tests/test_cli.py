@@ -87,7 +87,7 @@ def test_a_sequence_becomes_a_twin_scores_a_dataset_and_a_picture(endotwin, made
     code, out, _ = endotwin("eval", twin, "--json", "--sheet", sheet)
     scores = json.loads(out)
     assert code == 0
-    assert list(scores) == [*MEANS, "gamma", "light", "frames"]
+    assert list(scores) == [*MEANS, "lpips_network", "gamma", "light", "frames"]
     assert [frame["index"] for frame in scores["frames"]] == [0, 8]
     assert scores["psnr_covered"] > 25
     assert sheet.is_file()

@@ -195,7 +195,7 @@ class Renderer:
         if like:
             met, radiance = like._met, like._met.centres.image(light, shape)
         else:
-            met, radiance = self._met(light, T_world_camera, mask, hits, exposure)
+            met, radiance = self._met(light, T_world_camera, mask, hits)
         mean, count = met.mean_radiance(light)
         at = np.nonzero(met.edges)
         radiance[at] = np.where(count[:, None] > 0, mean, radiance[at])
@@ -208,8 +208,10 @@ class Renderer:
         if "sparkle" in self.twin.effects:
             distance_mm = met.centres.hits.laid_out(met.centres.hits.distance_mm, shape)
             radiance += sparkles(light, self._rough_mm2, self.camera, distance_mm)[..., None]
-        radiance, shown = self._shown(radiance, exposure)
-        color = shown.clip(0, 1, out=shown)
+        radiance *= self._exposure * exposure
+        if self._transmission is not None:
+            radiance *= self._transmission
+        color = self._displayed(radiance).clip(0, 1)
         return View(color, radiance, met.centres.hits, shape, self, met)
 
     @property
@@ -237,7 +239,6 @@ class Renderer:
         T_world_camera: np.ndarray,
         mask: np.ndarray | None,
         hits: Correspondences | None,
-        exposure: float,
     ) -> tuple[_Met, np.ndarray]:
         """What the rays of a view meet, and the radiance of its centres, [H, W, 3]."""
         shape = (self.camera.height, self.camera.width)
@@ -251,7 +252,9 @@ class Renderer:
         if centres.visible is not None:
             edges |= shadow_edges(laid_out(centres.visible, shape))
         radiance = centres.image(light, shape)
-        edges |= bent(self._shown(radiance, exposure)[1])
+        edges |= bent(
+            self._displayed(radiance)
+        )  # at any exposure the same: twice the gain is twice the light
         edges &= self._sees if mask is None else mask
         inside = (np.arange(SUBPIXELS) + 0.5) / SUBPIXELS - 0.5
         offsets = np.stack(np.meshgrid(inside, inside), axis=-1).reshape(-1, 2)
@@ -260,12 +263,9 @@ class Renderer:
         within = self._points(rays, self.caster.cast(rays, T_world_camera), light, T_world_camera)
         return _Met(centres, told, edges, within), radiance
 
-    def _shown(self, radiance: np.ndarray, exposure: float) -> tuple[np.ndarray, np.ndarray]:
-        """``radiance`` [H, W, 3] as it comes to the sensor, and as it is displayed where nothing clips."""
-        radiance = radiance * (self._exposure * np.float32(exposure))
-        if self._transmission is not None:
-            radiance *= self._transmission
-        return radiance, shading.respond(torch.from_numpy(radiance), self.twin.response.gamma).numpy()
+    def _displayed(self, radiance: np.ndarray) -> np.ndarray:
+        """Display values of ``radiance`` [H, W, 3], beyond 1 where they clip."""
+        return shading.respond(torch.from_numpy(radiance), self.twin.response.gamma).numpy()
 
     def _points(
         self, rays: Camera | Rays, hits: Correspondences, light: ViewLight, T_world_camera: np.ndarray
@@ -362,10 +362,8 @@ def _close_slits(radiance: np.ndarray, told: np.ndarray, edges: np.ndarray) -> N
 
 def bent(shown: np.ndarray) -> np.ndarray:
     """Bool [H, W]: pixels whose mean is not the value of their centre, by the curvature of ``shown`` [H, W,
-    3], in display values: a 24th of the Laplacian, for a parabola. Where all is white that does not show."""
-    gray = shown.mean(axis=2)
-    white = cv2.erode(gray, np.ones((3, 3), np.uint8)) > 1
-    return (np.abs(cv2.Laplacian(gray, -1)) > 24 * BENT) & ~white
+    3], in display values: a 24th of the Laplacian, for a parabola."""
+    return np.abs(cv2.Laplacian(shown.mean(axis=2), -1)) > 24 * BENT
 
 
 def shadow_edges(visible: np.ndarray) -> np.ndarray:
