@@ -154,8 +154,7 @@ def score(folder: Path, options: tuple[str, ...], work: Path) -> dict:
     if scores["lpips"] is not None:
         row["lpips_vgg"] = json.loads(endotwin("eval", twin, "--json", "--lpips", "vgg").stdout)["lpips"]
     record = json.loads((twin / "twin.json").read_text(encoding="utf-8"))["record"]["fuse"]
-    row |= {"fused": len(record["fused"]), **{name: scores[name] for name in ("psnr", "ssim", "lpips")}}
-    row |= {name: scores[name] for name in ("psnr_covered", "covered")}
+    row |= {"fused": len(record["fused"]), **{name: scores[name] for _, name, _ in SCORES if name in scores}}
     with whole_file(kept) as file:
         file.write_text(json.dumps(row, indent=1) + "\n", encoding="utf-8")
     return row

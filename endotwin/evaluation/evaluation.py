@@ -34,7 +34,6 @@ from endotwin.errors import OptionError, TwinError
 from endotwin.evaluation import metrics
 from endotwin.evaluation.highlights import Alike
 from endotwin.evaluation.kept import keep_scores
-from endotwin.evaluation.metrics import LPIPS_NETWORKS
 from endotwin.evaluation.renders import read_render, rendered_files
 from endotwin.evaluation.sheet import sheet_row
 from endotwin.light import shading
@@ -109,7 +108,7 @@ class Evaluation:
 
     frames: tuple[FrameScore, ...]
     scored: Twin | None = None
-    lpips_network: str = LPIPS_NETWORKS[0]
+    lpips_network: str = metrics.LPIPS_NETWORKS[0]
 
     @property
     def twin(self) -> Twin | None:
@@ -339,7 +338,7 @@ def evaluate(
     sequence: Sequence | Path | str | None = None,
     renders: Path | str | None = None,
     halves: bool = False,
-    lpips: str = LPIPS_NETWORKS[0],
+    lpips: str = metrics.LPIPS_NETWORKS[0],
 ) -> Evaluation:
     """Score a fitted twin, or another method's pictures, on frames that were held out of the fit.
 
@@ -368,8 +367,10 @@ def evaluate(
     twin = None if twin is None and renders is not None else as_twin(twin)
     if halves and renders is not None:
         raise OptionError("pictures of another method have no pose to fit; leave --halves or --renders out")
-    if lpips not in LPIPS_NETWORKS:
-        raise OptionError(f"lpips {lpips!r} is no network of LPIPS; choose from {', '.join(LPIPS_NETWORKS)}")
+    if lpips not in metrics.LPIPS_NETWORKS:
+        raise OptionError(
+            f"lpips {lpips!r} is no network of LPIPS; choose from {', '.join(metrics.LPIPS_NETWORKS)}"
+        )
     if sheet is not None:
         check_picture(sheet, overwrite)
     sequence, indices = _to_be_scored(twin, sequence, renders)

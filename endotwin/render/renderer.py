@@ -252,9 +252,8 @@ class Renderer:
         if centres.visible is not None:
             edges |= shadow_edges(laid_out(centres.visible, shape))
         radiance = centres.image(light, shape)
-        edges |= bent(
-            self._displayed(radiance)
-        )  # at any exposure the same: twice the gain is twice the light
+        # The same ones at any exposure: twice the gain is twice the light.
+        edges |= bent(self._displayed(radiance))
         edges &= self._sees if mask is None else mask
         inside = (np.arange(SUBPIXELS) + 0.5) / SUBPIXELS - 0.5
         offsets = np.stack(np.meshgrid(inside, inside), axis=-1).reshape(-1, 2)

@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from torch import nn
 from torch.nn import functional
+from torch.utils.data import ConcatDataset
 
 from endotwin.run.output import whole_file
 from endotwin.study.frames import Frames
@@ -113,12 +114,12 @@ def _resumed(network: nn.Module, optimizer: torch.optim.Optimizer, checkpoint: P
 def batch(pools: list[Frames], course: Course, step: int) -> tuple[torch.Tensor, torch.Tensor]:
     """Photos [B, 3, H, W] in [0, 1] and depth [B, H, W] in mm of one step."""
     generator = np.random.default_rng([course.seed, step])
-    frames = [(pool, index) for pool in pools for index in range(len(pool))]
+    frames = ConcatDataset(pools)
     colors, depths = [], []
     for _ in range(course.batch):
-        pool, index = frames[generator.integers(len(frames))]
+        index = int(generator.integers(len(frames)))
         across, down = (slice(None, None, -1 if flip else 1) for flip in generator.random(2) < 0.5)
-        color, depth_mm = pool[index]
+        color, depth_mm = frames[index]
         colors.append(color[down, across])
         depths.append(depth_mm[down, across])
     return as_tensor(np.stack(colors)), torch.from_numpy(np.stack(depths))
