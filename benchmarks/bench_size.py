@@ -2,7 +2,8 @@
 
 Renders sequences from a fitted twin with ``endotwin synth``, along a path through the poses of its own
 sequence, fuses and fits each, and scores it on its held-out frames. Seconds of cores are printed beside those
-of the wall clock: only where nothing else runs do both tell the same.
+of the wall clock: only where nothing else runs do both tell the same. With ``--every-frame`` each sequence
+has a second row, for which no frame was left out of the fusion: what leaving them out costs.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 from endotwin.sequence.poses import write_c3vd_poses
@@ -33,10 +35,14 @@ COLUMNS = (
 )
 
 
-def run(*arguments: object) -> tuple[float, float, str]:
+EVERY_FRAME = "import endotwin.cli.main as cli, endotwin.fusion as f; f.WORTH_PIXELS = 1e99; cli.main()"
+"""The command line, with every frame of any sequence being worth fusing."""
+
+
+def run(*arguments: object, entry: Sequence[str] = ("-m", "endotwin.cli.main")) -> tuple[float, float, str]:
     """Seconds of the wall clock, seconds of cores, and what was printed, of one command."""
     started, before = time.perf_counter(), os.times()
-    command = [sys.executable, "-m", "endotwin.cli.main", *map(str, arguments)]
+    command = [sys.executable, *entry, *map(str, arguments)]
     printed = subprocess.run(command, stdout=subprocess.PIPE, check=True, text=True, encoding="utf-8").stdout
     after = os.times()
     cores_s = after.children_user + after.children_system - before.children_user - before.children_system
@@ -53,10 +59,11 @@ def rendered(twin: Path, frames: int, folder: Path) -> Path:
     return made
 
 
-def measured(sequence: Path, scale: float, work: Path) -> dict[str, str]:
+def measured(sequence: Path, scale: float, work: Path, every_frame: bool) -> dict[str, str]:
     """One row of the table."""
     twin, profile = work / "twin", work / "profile.json"
-    fuse = run("fuse", sequence, "-o", twin, "--scale", scale, "--overwrite", "--profile", profile)
+    how = {"entry": ("-c", EVERY_FRAME)} if every_frame else {}
+    fuse = run("fuse", sequence, "-o", twin, "--scale", scale, "--overwrite", "--profile", profile, **how)
     peaks = [json.loads(profile.read_text())["peak_memory_mb"]]
     fit = run("fit", twin, "--overwrite", "--profile", profile)
     peaks.append(json.loads(profile.read_text())["peak_memory_mb"])
@@ -74,6 +81,7 @@ def main() -> None:
     parser.add_argument("twin", type=Path, help="a fitted twin whose sequence is still there")
     parser.add_argument("--frames", type=int, nargs="+", default=[300])
     parser.add_argument("--scale", type=float, default=1.0, help="factor on the image size, of fuse and fit")
+    parser.add_argument("--every-frame", action="store_true", help="a second row, of all frames fused")
     parser.add_argument("--folder", type=Path, help="where sequences are kept; unless given, they are not")
     options = parser.parse_args()
     print("|", " | ".join(COLUMNS), "|\n|", " | ".join("---" for _ in COLUMNS), "|")
@@ -81,8 +89,10 @@ def main() -> None:
         folder = options.folder or Path(work)
         folder.mkdir(parents=True, exist_ok=True)
         for frames in options.frames:
-            row = measured(rendered(options.twin, frames, folder), options.scale, Path(work))
-            print("|", " | ".join(row.values()), "|", flush=True)
+            sequence = rendered(options.twin, frames, folder)
+            for every_frame in [False, True][: 1 + options.every_frame]:
+                row = measured(sequence, options.scale, Path(work), every_frame)
+                print("|", " | ".join(row.values()), "|", flush=True)
 
 
 if __name__ == "__main__":

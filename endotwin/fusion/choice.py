@@ -34,7 +34,7 @@ CELL_PX = 24
 DIRECTIONS = 2.0
 """A component of a viewing direction is rounded to so many parts of one: bins of about 30°."""
 
-LEAST_NEW = 0.03
+LEAST_NEW = 0.012
 """A frame is left out where it adds less than this share of what a frame sees."""
 
 LACKING_PX = 6
@@ -43,8 +43,9 @@ LACKING_PX = 6
 LEAST_LACKING = 2
 """A frame is patched from where it shows at least so many such places that no other does."""
 
-PATCHED_FRAMES = 1.0
-"""At most so many frames are patched from besides those that were fused, in shares of these."""
+PATCHED_FRAMES = 3.0
+"""At most so many frames are patched from besides those that were fused, in shares of these: nearly any large
+one shows a strip of a pixel that no other does, and takes a quarter of a second."""
 
 
 @dataclass(frozen=True)
