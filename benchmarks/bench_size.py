@@ -15,7 +15,6 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Sequence
 from pathlib import Path
 
 from endotwin.sequence.poses import write_c3vd_poses
@@ -34,16 +33,19 @@ COLUMNS = (
     "PSNR covered",
 )
 
+COMMAND = ("-m", "endotwin.cli.main")
+EVERY_FRAME = (
+    "-c",
+    "import endotwin.cli.main as cli, endotwin.fusion as f; f.WORTH_PIXELS = 1e99; cli.main()",
+)
+"""The same command, to which every frame of any sequence is worth fusing."""
 
-EVERY_FRAME = "import endotwin.cli.main as cli, endotwin.fusion as f; f.WORTH_PIXELS = 1e99; cli.main()"
-"""The command line, with every frame of any sequence being worth fusing."""
 
-
-def run(*arguments: object, entry: Sequence[str] = ("-m", "endotwin.cli.main")) -> tuple[float, float, str]:
+def run(*arguments: object, command: tuple[str, str] = COMMAND) -> tuple[float, float, str]:
     """Seconds of the wall clock, seconds of cores, and what was printed, of one command."""
     started, before = time.perf_counter(), os.times()
-    command = [sys.executable, *entry, *map(str, arguments)]
-    printed = subprocess.run(command, stdout=subprocess.PIPE, check=True, text=True, encoding="utf-8").stdout
+    words = [sys.executable, *command, *map(str, arguments)]
+    printed = subprocess.run(words, stdout=subprocess.PIPE, check=True, text=True, encoding="utf-8").stdout
     after = os.times()
     cores_s = after.children_user + after.children_system - before.children_user - before.children_system
     return time.perf_counter() - started, cores_s, printed
@@ -59,11 +61,11 @@ def rendered(twin: Path, frames: int, folder: Path) -> Path:
     return made
 
 
-def measured(sequence: Path, scale: float, work: Path, every_frame: bool) -> dict[str, str]:
-    """One row of the table."""
+def measured(sequence: Path, scale: float, work: Path, command: tuple[str, str]) -> dict[str, str]:
+    """One row of the table, with ``command`` for the fusion."""
     twin, profile = work / "twin", work / "profile.json"
-    how = {"entry": ("-c", EVERY_FRAME)} if every_frame else {}
-    fuse = run("fuse", sequence, "-o", twin, "--scale", scale, "--overwrite", "--profile", profile, **how)
+    options = "--scale", scale, "--overwrite", "--profile", profile
+    fuse = run("fuse", sequence, "-o", twin, *options, command=command)
     peaks = [json.loads(profile.read_text())["peak_memory_mb"]]
     fit = run("fit", twin, "--overwrite", "--profile", profile)
     peaks.append(json.loads(profile.read_text())["peak_memory_mb"])
@@ -84,14 +86,15 @@ def main() -> None:
     parser.add_argument("--every-frame", action="store_true", help="a second row, of all frames fused")
     parser.add_argument("--folder", type=Path, help="where sequences are kept; unless given, they are not")
     options = parser.parse_args()
+    commands = (COMMAND, EVERY_FRAME) if options.every_frame else (COMMAND,)
     print("|", " | ".join(COLUMNS), "|\n|", " | ".join("---" for _ in COLUMNS), "|")
     with tempfile.TemporaryDirectory() as work:
         folder = options.folder or Path(work)
         folder.mkdir(parents=True, exist_ok=True)
         for frames in options.frames:
             sequence = rendered(options.twin, frames, folder)
-            for every_frame in [False, True][: 1 + options.every_frame]:
-                row = measured(sequence, options.scale, Path(work), every_frame)
+            for command in commands:
+                row = measured(sequence, options.scale, Path(work), command)
                 print("|", " | ".join(row.values()), "|", flush=True)
 
 
