@@ -99,6 +99,12 @@ def scaled_lengths(camera: Camera, scale: float) -> dict[str, float]:
     }
 
 
+def padded(camera: Camera, by: int) -> Camera:
+    """The camera whose picture goes on by so many pixels on each side."""
+    size = {"width": camera.width + 2 * by, "height": camera.height + 2 * by}
+    return dataclasses.replace(camera, **size, cx=camera.cx + by, cy=camera.cy + by)
+
+
 def first_positive_root(polynomial: Polynomial) -> float:
     """The least real root greater than 0, inf where there is none."""
     roots = polynomial.trim().roots()

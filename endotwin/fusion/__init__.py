@@ -15,6 +15,7 @@ from endotwin.fusion.coverage import covered, covered_by_glances
 from endotwin.fusion.denoise import denoised, pixel_noise
 from endotwin.fusion.doubts import doubt_frames, doubt_positions, doubt_scatter
 from endotwin.fusion.holes import filled
+from endotwin.fusion.margin import with_margin
 from endotwin.fusion.mesh import surface_of, without_short_edges
 from endotwin.fusion.reconcile import reconciled
 from endotwin.fusion.refine import refined
@@ -52,10 +53,11 @@ def fuse(
 ) -> Surface:
     """The surface that agrees with the depth maps of ``frames``; the same input gives the same mesh.
 
-    TSDF fusion, vertices refined against the depth maps, two rounds of carve and patch, small holes filled,
-    coverage. Noise that differs from pixel to pixel is averaged out first. As many frames are in memory as
-    SHELF_BYTES hold, and a few more. A frame without any valid depth is skipped with a warning in the log
-    ``endotwin``. Of many pixels, only the frames that see something new are fused (see ``choice``).
+    TSDF fusion, vertices refined against the depth maps, two rounds of carve and patch, small holes filled, a
+    margin about the pictures, coverage. Noise that differs from pixel to pixel is averaged out first. As many
+    frames are in memory as SHELF_BYTES hold, and a few more. A frame without any valid depth is skipped with
+    a warning in the log ``endotwin``. Of many pixels, only the frames that see something new are fused (see
+    ``choice``).
 
     Args:
         frames: indices whose depth may be used; all unless given.
@@ -124,6 +126,8 @@ def fuse(
     doubt_frames(sequence, shares)
     surface, _ = reconciled(camera, surface, views("carve and patch again", fused), tolerance, voxel_mm)
     surface = filled(camera, surface, views("fill holes", fused), tolerance, voxel_mm)
+    strips = (views(stage, fused) for stage in ("go on beside pictures", "keep what is sound"))
+    surface = with_margin(camera, surface, *strips, tolerance, median_mm)
     surface = smoothed(surface)
     photos = [index for index in photo_frames if seen is None or index in set(fused)]
     surface = covered(camera, surface, views("coverage", photos), sequence.lens_mask, tolerance)

@@ -71,7 +71,7 @@ def compare(
 ) -> Iterator[Comparison]:
     """Each of ``views`` against the caster's surface, the next one being cast while this one is used."""
 
-    def against(view: View) -> Comparison:
+    def compared(view: View) -> Comparison:
         measured = view.distance_mm.reshape(-1)
         hits = caster.cast(camera, view.T_world_camera, np.isfinite(view.distance_mm))
         residual_mm = np.where(np.isfinite(measured), np.float32(np.inf), np.float32(np.nan))
@@ -83,7 +83,7 @@ def compare(
         before, lacking = residual_mm < -allowed_mm, residual_mm > allowed_mm
         return Comparison(view, residual_mm, triangle, allowed_mm, at, before, lacking)
 
-    yield from ahead(against, views)
+    yield from ahead(compared, views)
 
 
 def measured_noise(camera: Camera, surface: Surface, views: Iterable[View]) -> float:
@@ -107,3 +107,33 @@ def agreement(camera: Camera, surface: Surface, views: Iterable[View], tolerance
         misses = seen.lacking & (seen.triangle < 0)
         tally += [seen.at.sum(), misses.sum(), (seen.lacking & ~misses).sum(), seen.before.sum()]
     return Agreement(*(tally / max(tally.sum(), 1)).tolist())
+
+
+def against(
+    camera: Camera, surface: Surface, points_mm: np.ndarray, view: View, tolerance: Tolerance
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Bool [N]: which of ``points_mm`` [N, 3], in the surface's frame, lie in the picture of ``view``; and of
+    those, bool each, which lie before what was measured about them, and which at it."""
+    T_local_camera = surface.to_local(view.T_world_camera).astype(np.float32)
+    ray_mm = points_mm - T_local_camera[:3, 3]
+    uv = camera.project(ray_mm @ T_local_camera[:3, :3])
+    with np.errstate(invalid="ignore"):
+        inside = ((uv >= 0) & (uv <= (camera.width - 1, camera.height - 1))).all(axis=1)
+    distance_mm = np.linalg.norm(ray_mm[inside], axis=1)
+    nearest_mm, farthest_mm = about(view.distance_mm, uv[inside])
+    before = distance_mm < nearest_mm - tolerance.at(nearest_mm)
+    at = ~before & (distance_mm <= farthest_mm + tolerance.at(farthest_mm))
+    return inside, before, at
+
+
+def about(distance_mm: np.ndarray, uv: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Least and greatest distance [N] that the four pixels about ``uv`` [N, 2] measured; -inf where none
+    did."""
+    height, width = distance_mm.shape
+    column, row = np.minimum(uv.astype(np.int32), (width - 2, height - 2)).T
+    first = row * width + column
+    flat = distance_mm.reshape(-1)
+    near = [flat[first + step] for step in (0, 1, width, width + 1)]
+    nearest_mm = np.fmin(np.fmin(near[0], near[1]), np.fmin(near[2], near[3]))
+    farthest_mm = np.fmax(np.fmax(near[0], near[1]), np.fmax(near[2], near[3]))
+    return np.nan_to_num(nearest_mm, nan=-np.inf), np.nan_to_num(farthest_mm, nan=-np.inf)

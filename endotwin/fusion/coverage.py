@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from endotwin.cameras import Camera
-from endotwin.fusion.agreement import Tolerance
+from endotwin.fusion.agreement import Tolerance, about
 from endotwin.fusion.choice import STRIDE, Glance
 from endotwin.fusion.refine import Sighting, sighting
 from endotwin.fusion.views import View
@@ -73,19 +73,6 @@ def covered_by_glances(
         seen_by[found.vertex] += 1
         nearest_mm[found.vertex] = np.minimum(nearest_mm[found.vertex], found.distance_mm)
     return surface.with_coverage(seen_by, nearest_mm)
-
-
-def about(distance_mm: np.ndarray, uv: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Least and greatest distance [N] that the four pixels about ``uv`` [N, 2] measured; -inf where none
-    did."""
-    height, width = distance_mm.shape
-    column, row = np.minimum(uv.astype(np.int32), (width - 2, height - 2)).T
-    first = row * width + column
-    flat = distance_mm.reshape(-1)
-    near = [flat[first + step] for step in (0, 1, width, width + 1)]
-    nearest_mm = np.fmin(np.fmin(near[0], near[1]), np.fmin(near[2], near[3]))
-    farthest_mm = np.fmax(np.fmax(near[0], near[1]), np.fmax(near[2], near[3]))
-    return np.nan_to_num(nearest_mm, nan=-np.inf), np.nan_to_num(farthest_mm, nan=-np.inf)
 
 
 def _reached(caster: Caster, T_world_camera: np.ndarray, seen: Sighting) -> np.ndarray:

@@ -10,8 +10,7 @@ import scipy.sparse
 from scipy.sparse.linalg import spsolve
 
 from endotwin.cameras import Camera
-from endotwin.fusion.agreement import Tolerance
-from endotwin.fusion.coverage import about
+from endotwin.fusion.agreement import Tolerance, against
 from endotwin.fusion.mesh import boundary_edges, surface_of
 from endotwin.fusion.smooth import neighbour_mean
 from endotwin.fusion.views import View
@@ -172,15 +171,7 @@ def _unpierced(
     """Bool [holes]: no more often in front of what was measured than at it, of local ``points_mm`` [N, 3]."""
 
     def votes(view: View) -> np.ndarray:
-        T_local_camera = surface.to_local(view.T_world_camera).astype(np.float32)
-        ray_mm = points_mm - T_local_camera[:3, 3]
-        uv = camera.project(ray_mm @ T_local_camera[:3, :3])
-        with np.errstate(invalid="ignore"):
-            inside = ((uv >= 0) & (uv <= (camera.width - 1, camera.height - 1))).all(axis=1)
-        distance_mm = np.linalg.norm(ray_mm[inside], axis=1)
-        nearest_mm, farthest_mm = about(view.distance_mm, uv[inside])
-        before = distance_mm < nearest_mm - tolerance.at(nearest_mm)
-        at = ~before & (distance_mm <= farthest_mm + tolerance.at(farthest_mm))
+        inside, before, at = against(camera, surface, points_mm, view, tolerance)
         return np.bincount(hole[inside], at.astype(int) - before.astype(int), hole[-1] + 1)
 
     return sum(ahead(votes, views, threads=THREADS)) >= 0
