@@ -5,6 +5,7 @@ from io import BytesIO
 import cv2
 import numpy as np
 import pytest
+from photos import levels, textured
 from PIL import Image
 
 from endotwin.effects.jpeg import quality_in, quality_of
@@ -14,15 +15,8 @@ from endotwin.sequence.readers import open_sequence
 SEEDS = range(3)
 
 
-def photo(seed: int, height: int = 120, width: int = 160, noise_levels: float = 1.0) -> np.ndarray:
-    """Smooth reddish texture at three scales with noise, uint8 [H, W, 3]."""
-    rng = np.random.default_rng(seed)
-    shade = sum(
-        size * cv2.GaussianBlur(rng.standard_normal((height, width)), (0, 0), size) for size in (3, 8, 25)
-    )
-    shade = 128 + 30 * shade / shade.std()
-    image = np.stack([shade, 0.7 * shade + 10, 0.5 * shade], axis=2)
-    return np.clip(image + noise_levels * rng.standard_normal(image.shape), 0, 255).round().astype(np.uint8)
+def photo(seed: int, noise_levels: float = 1.0) -> np.ndarray:
+    return levels(textured(seed, 120, 160), noise_levels, seed)
 
 
 def coded(image: np.ndarray, kind: str = "JPEG", **options: float) -> np.ndarray:
