@@ -13,7 +13,7 @@ from torch import Tensor
 
 from endotwin.effects.effect import Effect
 from endotwin.effects.exposure import Shot
-from endotwin.effects.processor import LUMA
+from endotwin.effects.luma import LUMA
 from endotwin.sequence import Sequence
 
 FIELDS = (-0.25, 0.25)

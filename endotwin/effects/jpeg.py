@@ -10,7 +10,7 @@ import numpy as np
 from PIL import Image
 from scipy.fft import dctn
 
-from endotwin.effects.processor import LUMA
+from endotwin.effects.luma import LUMA
 from endotwin.sequence.images import read_color
 
 BLOCK = 8
