@@ -8,7 +8,7 @@ from typing import ClassVar
 
 import cv2
 import numpy as np
-from scipy import stats
+from scipy.special import stdtrit
 from torch import Tensor
 
 from endotwin.effects.effect import Effect
@@ -79,7 +79,7 @@ class Interlacing(Effect):
         (rows, rows_error, tiles), (columns, columns_error, _) = _share(across), _share(along)
         told = f"{rows:.0%} of the finest detail alternates by rows, {columns:.0%} by columns"
         rows_error = max(rows_error, 0.5 / np.sqrt(tiles))
-        least = stats.t.isf(CHANCE, len(spread) - 1) * np.hypot(rows_error, columns_error)
+        least = stdtrit(len(spread) - 1, 1 - CHANCE) * np.hypot(rows_error, columns_error)
         if len(spread) > 1 and rows - max(0.5, columns) > least:
             return cls(), f"the photos are combed: {told}"
         return None, f"rendered on request: the photos show no two fields of different moments ({told})"

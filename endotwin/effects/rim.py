@@ -6,9 +6,8 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from scipy import stats
 from scipy.optimize import OptimizeResult, least_squares
-from scipy.special import ndtr
+from scipy.special import ndtr, stdtrit
 
 from endotwin.effects.luma import LUMA
 from endotwin.sequence import Sequence
@@ -94,7 +93,7 @@ def _sure(profiles: np.ndarray, group: np.ndarray, groups: np.ndarray) -> Unshar
     spread = np.sqrt(len(groups) - 1)
     overshoot_error = spread * np.std([_overshoot(other) for other in others])
     amount_error = max(amount_error, spread * np.std([other[2] for other in others]))
-    least = MODEL + stats.t.isf(CHANCE, len(groups) - 1) * overshoot_error
+    least = MODEL + stdtrit(len(groups) - 1, 1 - CHANCE) * overshoot_error
     if _overshoot(best) <= least or amount_error > SURE * best[2]:
         return None
     return Unsharp(float(best[2]), float(best[3]), float(_overshoot(best)))
