@@ -152,6 +152,6 @@ def test_path_traced_colons_tell_none(data_root, kind):
     assert Interlacing.evidence(open_sequence(data_root / f"colon_{kind}"))[0] is None
 
 
-def test_recorded_photos_of_c3vd_are_interlaced(data_root):
+def test_photos_from_the_video_of_c3vd_are_interlaced(data_root):
     """Their combs grow with the speed of the camera, and are gone where it is still."""
     assert Interlacing.evidence(open_sequence(data_root / "c3vd_cecum"))[0] is not None
