@@ -75,7 +75,7 @@ def synth(
         typer.Option(
             metavar="NAME=STATE,…",
             help="Effects on or off, as in noise=on,shadows=off; as the twin has them unless named. "
-            "like=SEQUENCE: with the noise, the lens and the JPEG quality that its photos show.",
+            "like=SEQUENCE: with the noise, lens, sharpening, JPEG quality and more that its photos show.",
             show_default=False,
         ),
     ] = "",

@@ -12,7 +12,9 @@ import tube_twin
 import endotwin
 from endotwin.effects import Effects, parse_states
 from endotwin.effects.codec import Codec
+from endotwin.effects.interlacing import Interlacing
 from endotwin.effects.noise import Noise
+from endotwin.effects.overlay import Overlay
 from endotwin.errors import OptionError, SequenceError
 from endotwin.synth import equipped
 
@@ -54,6 +56,31 @@ def test_a_recording_of_jpeg_files_is_coded_as_they_are(twin, noisy, tmp_path):
         file.unlink()
         cv2.imwrite(str(file.with_suffix(".jpg")), photo, [cv2.IMWRITE_JPEG_QUALITY, 40])
     assert equipped(twin, {"like": str(folder)}, "").effects["codec"] == Codec(40)
+
+
+def test_jpeg_photos_kept_as_png_are_coded_as_they_were(twin, noisy, tmp_path):
+    folder = shutil.copytree(noisy, tmp_path / "kept")
+    for file in folder.glob("*color.png"):
+        options = [cv2.IMWRITE_JPEG_QUALITY, 40]
+        coded = cv2.imencode(".jpg", cv2.imread(str(file)), options)[1]
+        cv2.imwrite(str(file), cv2.imdecode(coded, cv2.IMREAD_COLOR))
+    assert equipped(twin, {"like": str(folder)}, "").effects["codec"].quality == pytest.approx(40, abs=1)
+
+
+def test_corners_are_as_in_the_other_recording(twin, noisy, tmp_path):
+    folder = shutil.copytree(noisy, tmp_path / "cornered")
+    for file in folder.glob("*color.png"):
+        photo = cv2.imread(str(file)).astype(np.float32) / 255
+        cv2.imwrite(str(file), 255 * Overlay(0.25, letters=0.0).recorded(photo))
+    effects = equipped(twin, {"like": str(folder)}, "").effects
+    assert effects["overlay"].corner == pytest.approx(0.25, abs=1 / 120) and effects["overlay"].letters == 0
+    assert "lens" not in effects and "processor" not in effects
+
+
+def test_what_needs_a_velocity_is_left_out_of_poses_that_have_none(twin, noisy, monkeypatch):
+    monkeypatch.setattr(Interlacing, "evidence", classmethod(lambda cls, sequence: (cls(), "combed")))
+    assert "interlacing" in equipped(twin, {"like": str(noisy)}, "path.txt").effects
+    assert "interlacing" not in equipped(twin, {"like": str(noisy)}, "jitter:frames=2").effects
 
 
 def test_it_takes_the_place_of_the_twins_own(twin, noisy):

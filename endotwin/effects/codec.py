@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cache
-from io import BytesIO
-from pathlib import Path
 from typing import ClassVar
 
 import cv2
 import numpy as np
-from PIL import Image
 
 from endotwin.effects.effect import Effect, parameter
+from endotwin.effects.jpeg import quality_of
 from endotwin.sequence import Sequence
 
 FILES = 8
@@ -43,40 +40,10 @@ class Codec(Effect):
 
     @classmethod
     def evidence(cls, sequence: Sequence) -> tuple[Codec | None, str]:
-        """Of JPEG files by their own tables; what other files lost to a codec before is not told."""
+        """Of JPEG files by their own tables, of others by what a JPEG's steps left in their pixels."""
         files = sequence.color_files[:: max(len(sequence) // FILES, 1)]
-        qualities = [quality for quality in map(_quality_of, files) if quality is not None]
-        if sequence.scale != 1 or len(qualities) < len(files):
-            return None, "rendered on request: photos that are no JPEG files as they were coded do not tell"
+        qualities = [quality_of(file) for file in files] if sequence.scale == 1 else [None]
+        if None in qualities:
+            return None, "rendered on request: the photos are no JPEG files and show no steps of one"
         quality = float(np.median(qualities))
-        return cls(quality), f"the photos are JPEG files of quality {quality:g}"
-
-
-def _quality_of(file: Path) -> float | None:
-    """The quality at which libjpeg's steps of brightness are nearest to a JPEG file's, by their logarithms;
-    None of other files."""
-    steps = _steps(file)
-    if steps is None:
-        return None
-    return 1.0 + np.abs(np.log(_steps_by_quality()) - np.log(steps)).mean(axis=1).argmin()
-
-
-@cache
-def _steps_by_quality() -> np.ndarray:
-    """Steps of libjpeg's luminance, [100, 64], of qualities 1 to 100."""
-    tables = []
-    for quality in range(1, 101):
-        coded = BytesIO()
-        Image.new("L", (8, 8)).save(coded, "JPEG", quality=quality)
-        tables.append(_steps(coded))
-    return np.stack(tables)
-
-
-def _steps(file: Path | BytesIO) -> np.ndarray | None:
-    """Steps, [64], in which a JPEG file keeps the cosine coefficients of brightness; None of other files."""
-    try:
-        with Image.open(file) as photo:
-            tables = getattr(photo, "quantization", None)
-    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):
-        return None
-    return np.asarray(tables[0], float) if tables and 0 in tables else None
+        return cls(quality), f"the photos were coded as JPEG pictures of quality {quality:g}"

@@ -13,6 +13,7 @@ from torch import Tensor
 from endotwin.cameras import Camera, Pinhole
 from endotwin.effects.axis import angle_from_axis, focal_px
 from endotwin.effects.effect import Effect, parameter
+from endotwin.effects.overlay import legs_px
 from endotwin.sequence import Sequence
 
 FULL = 0.999
@@ -56,6 +57,8 @@ class Lens(Effect):
     @classmethod
     def evidence(cls, sequence: Sequence) -> tuple[Lens | None, str]:
         """A black surround in the photos, or a camera model that no plain pinhole is."""
+        if legs_px(sequence.lens_mask) is not None:
+            return None, "the photos' black corners leave an octagon, which is the effect overlay's"
         return cls.told_by(sequence.camera, sequence.lens_mask)
 
     @classmethod

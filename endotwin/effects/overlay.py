@@ -21,6 +21,15 @@ MARGIN = 1.0
 WHITE = 0.9
 """Display value of the text."""
 
+PHOTOS = 8
+"""Spread over a sequence, whose mean tells where its corners end."""
+
+NEAR_PX = 1.0
+"""Mean distance from the edges of an octagon within which the photos' black ends."""
+
+BESIDE_PX = 8
+"""Off the edges of the octagon, on either side, where a picture is lit or black whatever a codec did."""
+
 
 @dataclass(frozen=True)
 class Overlay(Effect):
@@ -50,8 +59,38 @@ class Overlay(Effect):
 
     @classmethod
     def evidence(cls, sequence: Sequence) -> tuple[Overlay | None, str]:
-        """Never by itself: its corners are told as the lens's edge, and its text hides what no view needs."""
-        return None, "rendered on request: what a processor draws over its pictures is no part of the scene"
+        """Black corners of one size, cut at 45°, which no lens draws. What a text says is not read."""
+        leg_px = legs_px(sequence.lens_mask)
+        if leg_px is None:
+            return None, "rendered on request: the photos have no four black corners that leave an octagon"
+        corner = _edge_px(sequence, leg_px) / sequence.camera.height
+        return cls(corner, letters=0.0), f"black corners leave an octagon: {corner:.3f} of the height"
+
+
+def legs_px(lit: np.ndarray) -> float | None:
+    """Legs of four triangles in the corners that are what is dark in ``lit`` [H, W], but for NEAR_PX of their
+    edges' length; None where they are not."""
+    height, width = lit.shape
+    leg_px = float(np.sqrt(np.count_nonzero(~lit) / 2))
+    if not NEAR_PX < leg_px <= height / 2:
+        return None
+    stop, _ = _drawn(Overlay(leg_px / height, letters=0.0), height, width)
+    wrong = np.count_nonzero(stop == lit)
+    return leg_px if wrong <= NEAR_PX * 4 * np.sqrt(2) * leg_px else None
+
+
+def _edge_px(sequence: Sequence, leg_px: float) -> float:
+    """Legs of the triangles by where the mean photo is half as bright as beside them.
+
+    The surround that a mask tells is wider by as much as a codec or a sharpening processor reaches.
+    """
+    spread = np.unique(np.linspace(0, len(sequence) - 1, PHOTOS).round().astype(int))
+    mean = np.mean([sequence.color(index).max(axis=2) for index in spread], axis=0)
+    x, y = (np.minimum(np.arange(size), np.arange(size)[::-1]) for size in mean.shape[::-1])
+    line = x + y[:, None]
+    lines = np.arange(max(int(leg_px) - BESIDE_PX, 0), int(leg_px) + BESIDE_PX)
+    level = np.array([np.median(mean[line == number]) for number in lines])
+    return float(lines[np.argmax(level > level[-1] / 2)]) + 0.5
 
 
 @lru_cache(maxsize=4)

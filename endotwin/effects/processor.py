@@ -8,11 +8,10 @@ from typing import ClassVar
 import cv2
 import numpy as np
 
+from endotwin.effects import rim
 from endotwin.effects.effect import Effect, parameter
+from endotwin.effects.luma import LUMA
 from endotwin.sequence import Sequence
-
-LUMA = np.array([0.299, 0.587, 0.114], np.float32)
-"""Shares of R, G and B in luminance (ITU-R BT.601)."""
 
 
 @dataclass(frozen=True)
@@ -39,5 +38,12 @@ class Processor(Effect):
 
     @classmethod
     def evidence(cls, sequence: Sequence) -> tuple[Processor | None, str]:
-        """Never by itself: a sharpened photo of soft tissue and a plain one of crisp tissue look alike."""
-        return None, "rendered on request: photos alone do not tell sharpening from crisp tissue"
+        """Sharpening where the edge of the lens circle overshoots; of a tone curve nothing is told."""
+        found = rim.unsharp(sequence)
+        if found is None:
+            return None, (
+                "rendered on request: no sharp edge of a lens circle overshoots, and elsewhere photos do not "
+                "tell sharpening from crisp tissue"
+            )
+        told = f"the edge of the lens circle overshoots by {found.overshoot:.0%}"
+        return cls(contrast=0.0, sharpening=found.amount, radius=found.radius_px), told

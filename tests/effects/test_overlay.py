@@ -6,11 +6,15 @@ import cv2
 import numpy as np
 import pytest
 import tube_twin
+from photos import levels, photographed, textured
 
 import endotwin
 import endotwin.synth
 from endotwin.effects import Effects
+from endotwin.effects.codec import Codec
+from endotwin.effects.lens import Lens
 from endotwin.effects.overlay import Overlay
+from endotwin.sequence.readers import open_sequence
 
 
 @pytest.mark.parametrize("corner", [0.1, 0.25, 0.4])
@@ -54,3 +58,32 @@ def test_the_label_tells_which_pixels_of_rgb_alone_are_hidden(tmp_path):
     assert 0.05 < told.mean() < 0.3 and not ((one != other).any(axis=2) & ~told).any()
     assert not cv2.imread(str(tmp_path / "plain" / "0001_overlay.png")).any()
     assert endotwin.synth.prove(tmp_path / "drawn").holds
+
+
+@pytest.mark.parametrize("size", [(240, 320), (301, 301), (480, 400)])
+@pytest.mark.parametrize("corner, quality", [(0.1, None), (0.25, None), (0.4, None), (0.2, 60), (0.4, 60)])
+def test_the_corners_of_photos_are_told_to_a_pixel(tmp_path, size, corner, quality):
+    drawn = Overlay(corner, letters=0.03)
+    photos = [drawn.recorded(levels(textured(k, *size), 2, k) / np.float32(255)) for k in range(8)]
+    coded = photos if quality is None else [Codec(quality).recorded(photo) for photo in photos]
+    sequence = photographed(tmp_path, [levels(photo) for photo in coded])
+    found, _ = Overlay.evidence(sequence)
+    assert found.corner == pytest.approx(corner, abs=1 / size[0]) and found.letters == 0
+    assert Lens.evidence(sequence)[0] is None
+
+
+def test_other_black_than_four_equal_corners_tells_no_octagon(tmp_path):
+    height, width = 240, 320
+    x, y = np.meshgrid(np.arange(width), np.arange(height))
+    one_corner = x + y < 80
+    unequal = one_corner | (width - x + y < 40) | (x + height - y < 80) | (width - x + height - y < 40)
+    circle = np.hypot(x - 159.5, y - 119.5) > 130
+    bars = (x < 40) | (x >= width - 40)
+    for black in (one_corner, unequal, circle, bars, np.zeros((height, width), bool)):
+        photos = [levels(np.where(black[..., None], 0, textured(k)), 0, k) for k in range(8)]
+        assert Overlay.evidence(photographed(tmp_path, photos))[0] is None
+
+
+@pytest.mark.parametrize("kind", ["direct", "offset", "fisheye", "bounce", "wet", "scope"])
+def test_path_traced_colons_have_no_octagon(data_root, kind):
+    assert Overlay.evidence(open_sequence(data_root / f"colon_{kind}"))[0] is None

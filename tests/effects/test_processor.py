@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from scipy.special import erf
 
-from endotwin.effects.processor import LUMA, Processor
+from endotwin.effects.luma import LUMA
+from endotwin.effects.processor import Processor
 
 
 def edge(low: float, high: float) -> np.ndarray:

@@ -41,7 +41,7 @@ def equipped(twin: Twin, states: Mapping[str, str], trajectory: object) -> Twin:
     """The twin with effects on or off as ``states`` say, as strong as its sequence shows them to be.
 
     Under the name ``like`` stands the path of another sequence, whose strengths are taken instead; what its
-    photos show is on unless a state says otherwise.
+    photos show is on unless a state says otherwise, or it needs a velocity that the trajectory lacks.
 
     Raises:
         OptionError: an effect that only a fit can turn on or decide, or blur of a trajectory without a
@@ -56,8 +56,9 @@ def equipped(twin: Twin, states: Mapping[str, str], trajectory: object) -> Twin:
             f"{undecided[0]}=auto is for 'endotwin fit', which decides; write {undecided[0]}=on or off here"
         )
     effects = twin.effects.without([name for name, state in states.items() if state == "off"])
+    still = SUCCESSIVE if str(trajectory).startswith("jitter") else ()
     if sequence is not None:
-        asked = [name for name in RENDERED if name not in states]
+        asked = [name for name in RENDERED if name not in states and name not in still]
         shown = [effect for name in asked if (effect := effect_class(name).evidence(sequence)[0])]
         for effect in shown:
             effects = effects.including(effect)
@@ -72,7 +73,7 @@ def equipped(twin: Twin, states: Mapping[str, str], trajectory: object) -> Twin:
             continue
         if name in FITTED and name not in ("coat", "sparkle"):
             raise OptionError(f"the twin has no {name}; a fit with its effect {name} on finds it")
-        if name in SUCCESSIVE and str(trajectory).startswith("jitter"):
+        if name in still:
             raise OptionError(f"{name} needs poses that follow each other, and those of jitter do not")
         found = effect_class(name).evidence(sequence or twin.sequence())[0] if name in RENDERED else None
         effects = effects.including(found or effect_class(name)())
