@@ -89,14 +89,16 @@ def _with_one(
     normals = unit(weights @ surface.normals.astype(np.float64))
     placed, turned = patch.grown(rest[inside], normals[moves] @ site.axes.T)
     vertices_mm = weights @ surface.vertices_mm.astype(np.float64)
-    vertices_mm[moves] = site.placed(placed)
+    if not shape.flat:
+        vertices_mm[moves] = site.placed(placed)
+    changed = moves[:0] if shape.flat else moves
     turn = turned @ site.axes - normals[moves]
     normals[moves] += turn
     grown_surface = Surface(
         surface.origin_mm,
-        _kept(surface.vertices_mm, vertices_mm, moves),
+        _kept(surface.vertices_mm, vertices_mm, changed),
         fine.replaced(surface.triangles, fine.vertices[triangles]).astype(np.int32),
-        _kept(surface.normals, normals, moves),
+        _kept(surface.normals, normals, changed),
         *_coverage(surface, weights),
     )
     colors = _Colors(shape, seedling.ihb / IHB / twin.response.gamma, moves, t[inside], placed)
@@ -166,8 +168,8 @@ class _Patch:
         self.site, self.shape = site, shape
 
     def t(self, rest: np.ndarray) -> np.ndarray:
-        """Distance of points [N, 3] from the axis, as a share of the disc's radius."""
-        return np.linalg.norm(rest[:, :2], axis=1) / self.shape.radius_mm
+        """``Shape.t`` of points [N, 3]."""
+        return self.shape.t(rest[:, :2])
 
     def inside(self, rest: np.ndarray) -> np.ndarray:
         """Bool [N]: points that the polyp is made of."""
@@ -181,6 +183,8 @@ class _Patch:
 
     def grown(self, rest: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Where points [N, 3] with ``normals`` [N, 3] go, and their normals there."""
+        if self.shape.flat:
+            return rest, normals
         step = STEP * (np.linalg.norm(rest[:, :2], axis=1) + self.shape.radius_mm / self.shape.magnified)
         sides = []
         for axis in np.eye(2):
@@ -195,6 +199,8 @@ class _Patch:
         return self._grown(rest), unit(facing + self._rough(rest)[:, None] * (normals - level))
 
     def _grown(self, rest: np.ndarray) -> np.ndarray:
+        if self.shape.flat:
+            return rest
         moved = self.site.grown(self.shape, rest[:, :2])
         moved[:, 2] += self._rough(rest) * (rest[:, 2] - self.site.height_mm(rest[:, :2]))
         return moved
@@ -286,7 +292,7 @@ def _measured(
     return Polyp(
         kind=shape.kind,
         size_mm=round(diameter(placed[head, :2]), 3),
-        height_mm=round(float(above.max()), 3),
+        height_mm=0.0 if shape.flat else round(float(above[np.abs(above).argmax()]), 3),
         place_mm=tuple(round(float(x), 3) for x in site.foot_mm + origin_mm),
         axis=tuple(round(float(x), 5) for x in site.axes[2]),
         triangles=(0, 0),

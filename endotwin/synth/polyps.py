@@ -46,7 +46,9 @@ class PolypOptions(WallPoint):
     """Options of a polyp of any class."""
 
     size: float = field(default=6.0, metadata={"help": "greatest diameter, of the head of a stalk, mm"})
-    height: float = field(default=0.0, metadata={"help": "above the wall, mm; 0: the class's usual one"})
+    height: float = field(
+        default=0.0, metadata={"help": "above the wall, mm; 0: the class's usual one", "signed": True}
+    )
     count: int = field(default=1, metadata={"help": "number of such polyps"})
     ihb: float = field(
         default=2.9, metadata={"help": "index of haemoglobin above that of the wall", "signed": True}
@@ -184,7 +186,7 @@ class _Garden:
         clear_mm = shape.size_mm / 2 + (limits.clearance_mm if limits else 0.0)
         cameras = self._trajectory.T_world_camera[:, :3, 3] - self._twin.surface.origin_mm
         local = site.within(cameras)
-        local[:, 2] -= np.clip(local[:, 2], 0, shape.height_mm)
+        local[:, 2] -= np.clip(local[:, 2], 0, max(shape.height_mm, 0))
         near = dot(local, local) < clear_mm**2
         return "a pose of the trajectory is too near to it" if near.any() else ""
 
