@@ -91,7 +91,8 @@ def synth(
         list[str] | None,
         typer.Option(
             metavar="CLASS:…",
-            help="Grow polyps on the wall, of the Paris classes Ip (on a stalk), Is (sessile) or IIa (flat): "
+            help="Grow polyps on the wall, of the Paris classes Ip (on a stalk), Is (sessile), IIa (slightly "
+            "elevated), IIb (flat) or IIc (slightly depressed): "
             "'Is:size=6,height=…,count=3,ihb=…', at random where the trajectory sees the wall, or at "
             "'x=…,y=…,z=…' or 'frame=…,u=…,v=…'; may be repeated.",
         ),

@@ -247,7 +247,8 @@ def with_polyps(
 
     Args:
         twin: or its folder.
-        polyps: one such as ``Is:size=6,count=3`` (classes Ip, Is and IIa of the Paris workshop), or several.
+        polyps: one such as ``Is:size=6,count=3`` (classes Ip, Is, IIa, IIb and IIc of the Paris
+            workshop), or several.
         trajectory: that sees the places which are not given, as of ``synthesize``; without one, they are
             anywhere on wall that the training photos show.
         seed: of shapes and places. limits: of the trajectory's poses.
