@@ -179,7 +179,7 @@ class Shape:
 
     def t(self, across_mm: np.ndarray) -> np.ndarray:
         """Distance of the disc's points [N, 2] from the axis as a share of its radius, [N]; of the radius in
-        the direction of each, where the polyp is flat, so that its outline has lobes though no point moves."""
+        the direction of each, where the polyp is flat: its outline has lobes though no point moves."""
         t = np.linalg.norm(across_mm, axis=1) / self.radius_mm
         return t / (self._wider * (1 + self._swing(across_mm))) if self.flat else t
 
