@@ -1,0 +1,105 @@
+"""How fluid spreads over a part of a mesh: as a film with ragged edges, as lumps, or as a level pool."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import scipy.sparse
+from scipy.sparse.csgraph import connected_components, dijkstra
+
+from endotwin.anatomy.shape import smoothstep
+
+WAVES = 24
+FINE, COARSE = 0.05, 0.9
+"""Wavelengths of what makes a film uneven, in sizes."""
+
+RUN = 2.0
+"""How many times longer its pattern is along the way it ran."""
+
+RAGGED = 0.55
+"""Swing of a film's edge, as a share of its reach."""
+
+LEVELS = 14
+"""Halvings by which a pool's level is found."""
+
+
+def edges_of(points: np.ndarray, triangles: np.ndarray) -> scipy.sparse.csr_array:
+    """The graph of edges, with their lengths, of triangles [F, 3] of points [P, 3]."""
+    ends = np.sort(triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+    one, other = np.unique(ends, axis=0).T
+    length = np.maximum(np.linalg.norm(points[one] - points[other], axis=1), 1e-9)
+    return scipy.sparse.coo_array((length, (one, other)), shape=(len(points),) * 2).tocsr()
+
+
+def along_mesh(graph: scipy.sparse.csr_array, start: int, limit_mm: float) -> np.ndarray:
+    """Length of the shortest way [P] along edges from a point; inf beyond the limit."""
+    return dijkstra(graph, directed=False, indices=start, limit=limit_mm)
+
+
+def noise(
+    size_mm: float, run: np.ndarray, generator: np.random.Generator
+) -> Callable[[np.ndarray], np.ndarray]:
+    """A pattern of points [P, 3], of mean 0 and standard deviation 1, drawn by chance: plane waves whose
+    amplitudes are as the square root of their lengths, stretched along the unit vector ``run`` [3]."""
+    directions = generator.standard_normal((WAVES, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    directions -= (1 - 1 / RUN) * (directions @ run)[:, None] * run
+    lengths_mm = size_mm * np.geomspace(FINE, COARSE, WAVES)
+    offsets = generator.uniform(0, 2 * np.pi, WAVES)
+    amplitudes = np.sqrt(2 * lengths_mm / lengths_mm.sum())
+    waves = 2 * np.pi * directions / lengths_mm[:, None]
+    return lambda points: np.cos(points @ waves.T + offsets) @ amplitudes
+
+
+def within(far_mm: np.ndarray, size_mm: float, pattern: np.ndarray) -> np.ndarray:
+    """How far inside a film of ``size_mm`` points [P] are, 1 about its middle, at most 0 outside, whose edge
+    swings with a ``pattern`` [P]; nothing of it is farther than half its size along the mesh."""
+    reach = 1 - 2 * np.minimum(far_mm / size_mm, 1)
+    return np.minimum(1.5 * reach - RAGGED / 2 + RAGGED * pattern, 4 * reach)
+
+
+def film(inside: np.ndarray, pattern: np.ndarray) -> np.ndarray:
+    """Share of its thickness [P] that a film has: thin towards its edge, and uneven."""
+    return smoothstep(inside / 0.7) ** 2 * (0.06 + 0.94 * smoothstep(0.5 + 0.3 * pattern))
+
+
+def strands(inside: np.ndarray, pattern: np.ndarray) -> np.ndarray:
+    """As ``film``, of what is viscous and draws threads: ridges where the pattern crosses 0."""
+    return smoothstep(inside / 0.45) * (0.3 + 0.7 * np.exp(-((pattern / 0.45) ** 2)))
+
+
+def lumps(inside: np.ndarray, pattern: np.ndarray) -> np.ndarray:
+    """As ``film``, of what holds its shape: domes with bumps."""
+    return smoothstep(inside / 0.9) ** 0.7 * (0.55 + 0.45 * smoothstep(0.5 + 0.3 * pattern))
+
+
+def pool_mm(
+    height_mm: np.ndarray,
+    allowed: np.ndarray,
+    graph: scipy.sparse.csr_array,
+    lowest: int,
+    deepest_mm: float,
+) -> np.ndarray:
+    """Depth [P] of the fluid that stands about the point ``lowest``: as high as it may without being deeper
+    than ``deepest_mm``, covering points that are not ``allowed``, bool [P], or running to lower ones.
+
+    Args:
+        height_mm: [P]. graph: of the edges between the points.
+    """
+
+    def filled(level_mm: float) -> np.ndarray:
+        below = np.flatnonzero(height_mm < level_mm)
+        _, part = connected_components(graph[below][:, below], directed=False)
+        return below[part == part[np.searchsorted(below, lowest)]]
+
+    foot_mm, depth_mm = height_mm[lowest], np.zeros(len(height_mm))
+    low, high = foot_mm, foot_mm + deepest_mm
+    for _ in range(LEVELS):
+        level = (low + high) / 2
+        at = filled(level)
+        if allowed[at].all() and height_mm[at].min() >= foot_mm:
+            low, depth_mm[at] = level, level - height_mm[at]
+        else:
+            high = level
+    return depth_mm
