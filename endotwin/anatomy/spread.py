@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from heapq import heapify, heappop, heappush
 
 import numpy as np
 import scipy.sparse
@@ -19,9 +20,6 @@ RUN = 2.0
 
 RAGGED = 0.55
 """Swing of a film's edge, as a share of its reach."""
-
-LEVELS = 14
-"""Halvings by which a pool's level is found."""
 
 
 def edges_of(points: np.ndarray, triangles: np.ndarray) -> scipy.sparse.csr_array:
@@ -75,31 +73,37 @@ def lumps(inside: np.ndarray, pattern: np.ndarray) -> np.ndarray:
 
 
 def pool_mm(
-    height_mm: np.ndarray,
-    allowed: np.ndarray,
-    graph: scipy.sparse.csr_array,
-    lowest: int,
-    deepest_mm: float,
+    height_mm: np.ndarray, inside: np.ndarray, graph: scipy.sparse.csr_array, deepest_mm: float
 ) -> np.ndarray:
-    """Depth [P] of the fluid that stands about the point ``lowest``: as high as it may without being deeper
-    than ``deepest_mm``, covering points that are not ``allowed``, bool [P], or running to lower ones.
+    """Depth [P] of the fluid that stands in the hollow, of those among the points ``inside``, bool [P], which
+    holds most; over other points it runs off.
 
     Args:
-        height_mm: [P]. graph: of the edges between the points.
+        height_mm: [P]. graph: of the edges between the points. deepest_mm: greatest depth.
     """
+    depth_mm = spill_mm(height_mm, inside, graph) - height_mm
+    full = np.flatnonzero(depth_mm > 0)
+    if not len(full):
+        return depth_mm
+    _, part = connected_components(graph[full][:, full], directed=False)
+    held = full[part == np.bincount(part, np.minimum(depth_mm[full], deepest_mm)).argmax()]
+    result = np.zeros(len(height_mm))
+    result[held] = np.maximum(depth_mm[held] - max(depth_mm[held].max() - deepest_mm, 0), 0)
+    return result
 
-    def filled(level_mm: float) -> np.ndarray:
-        below = np.flatnonzero(height_mm < level_mm)
-        _, part = connected_components(graph[below][:, below], directed=False)
-        return below[part == part[np.searchsorted(below, lowest)]]
 
-    foot_mm, depth_mm = height_mm[lowest], np.zeros(len(height_mm))
-    low, high = foot_mm, foot_mm + deepest_mm
-    for _ in range(LEVELS):
-        level = (low + high) / 2
-        at = filled(level)
-        if allowed[at].all() and height_mm[at].min() >= foot_mm:
-            low, depth_mm[at] = level, level - height_mm[at]
-        else:
-            high = level
-    return depth_mm
+def spill_mm(height_mm: np.ndarray, inside: np.ndarray, graph: scipy.sparse.csr_array) -> np.ndarray:
+    """Level [P] at which fluid over each point runs off: the priority flood of Barnes, Lehman and Mulla
+    (Computers & Geosciences 2014; 62: 117, algorithm 1), from the points that are not ``inside``."""
+    both = (graph + graph.T).tocsr()
+    starts, neighbours = both.indptr.tolist(), both.indices.tolist()
+    level, open_ = height_mm.tolist(), inside.tolist()
+    queue = [(level[k], k) for k in np.flatnonzero(~inside).tolist()]
+    heapify(queue)
+    while queue:
+        at_mm, k = heappop(queue)
+        for j in neighbours[starts[k] : starts[k + 1]]:
+            if open_[j]:
+                open_[j], level[j] = False, max(level[j], at_mm)
+                heappush(queue, (level[j], j))
+    return np.where(np.array(open_), height_mm, level)

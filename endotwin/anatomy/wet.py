@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,7 +16,7 @@ from endotwin.anatomy.refine import Refined
 from endotwin.anatomy.shape import smoothstep
 from endotwin.surface import Surface
 from endotwin.surface.casting import Caster
-from endotwin.surface.vectors import unit
+from endotwin.surface.vectors import dot, unit
 from endotwin.twin import Materials, Twin
 from endotwin.twin.fluids import Fluid, covered
 from endotwin.twin.polyps import numbered
@@ -27,8 +28,8 @@ FINEST_MM, COARSEST_MM = 0.1, 0.25
 FLOOR = 0.1
 """Least cosine between the floor of a pool and the vertical."""
 
-SHALLOWEST_MM = 0.3
-"""A pool is deeper somewhere."""
+SHALLOWEST_MM, FEWEST = 0.3, 200
+"""A pool is deeper somewhere, and covers more vertices: a pit of the mesh is none."""
 
 LEAST_MM = 1e-3
 """Fluid that is thinner is none."""
@@ -40,10 +41,17 @@ WET_MM = 0.05
 """A layer so thick has a surface of its own."""
 
 ROOM = 1.2
-"""A layer needs so many times its thickness, and ROOM_MM, above it."""
-ROOM_MM = 0.05
+"""A layer needs so many times its thickness above it."""
+
+CREASE = 0.3
+"""A film on both walls of a crease is no thicker than this share of the way between them."""
+
+CLEAR_MM = 0.01
+"""Above the mesh, to where a ray leaves it for sure."""
 
 SPREADS = {"film": spread.film, "strands": spread.strands, "lumps": spread.lumps}
+
+Room = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
 MOST_POINTS = 2000
 """By which the extent of a patch is measured."""
@@ -75,8 +83,8 @@ class Puddle:
 
     @property
     def reach_mm(self) -> float:
-        """Of the mesh that is looked at; the lowest point about the start may lie half a size from it."""
-        return self.size_mm * (1.05 if self.pool else 0.55)
+        """Of the mesh that is looked at."""
+        return 0.55 * self.size_mm
 
 
 class Wetted:
@@ -98,24 +106,26 @@ class Wetted:
         surface = self.twin.surface
         fine = _refined(surface, puddle)
         normals = unit(fine.weights[fine.vertices] @ surface.normals.astype(np.float64))
-        layer = _layer(puddle, fine, normals)
+        layer = _layer(puddle, fine, normals, self._room_mm)
         on = layer.thickness_mm[fine.triangles].max(axis=1) > 0
         fault = self._fault(puddle, fine, layer, on)
         if not fault:
             self._lay(puddle, fine, layer, normals, on)
         return fault
 
+    def _room_mm(self, points: np.ndarray, towards: np.ndarray) -> np.ndarray:
+        """How far [N] it is from ``points`` of the wall to other wall along ``towards``, [N, 3] each."""
+        start = (points + CLEAR_MM * towards).astype(np.float32)
+        return self._caster.cast_rays(start, towards.astype(np.float32))[2]
+
     def _fault(self, puddle: Puddle, fine: Refined, layer: _Layer, on: np.ndarray) -> str:
         if not on.any():
             return "it would run off" if puddle.pool else "the mesh is too coarse"
         if self._fluids[fine.origin[on]].any():
             return "another fluid lies there"
-        thick = layer.thickness_mm > LEAST_MM
-        start, towards = fine.rest[thick], layer.towards[thick]
-        way_mm = ROOM * layer.thickness_mm[thick] + ROOM_MM
-        free = self._caster.unobstructed(
-            (start + LEAST_MM * towards).astype(np.float32), towards.astype(np.float32), way_mm
-        )
+        thick = layer.thickness_mm > 0
+        room_mm = self._room_mm(fine.rest[thick], layer.towards[thick])
+        free = ROOM * layer.thickness_mm[thick] < room_mm
         return "" if free.all() else "the lumen is too narrow there"
 
     def _lay(self, puddle: Puddle, fine: Refined, layer: _Layer, normals: np.ndarray, on: np.ndarray) -> None:
@@ -167,6 +177,19 @@ class Wetted:
         )
 
 
+def hollows_mm(surface: Surface, down: np.ndarray) -> np.ndarray:
+    """How deep fluid may stand on each vertex, float64 [V], before it runs off, gravity being along ``down``
+    [3]: to wall that is no floor, or to the edge of the mesh."""
+    points = surface.vertices_mm.astype(np.float64)
+    graph = spread.edges_of(points, surface.triangles)
+    inside = surface.normals @ -down > FLOOR
+    ends = np.sort(surface.triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+    edges, times = np.unique(ends, axis=0, return_counts=True)
+    inside[edges[times == 1]] = False
+    height_mm = points @ -down
+    return spread.spill_mm(height_mm, inside, graph) - height_mm
+
+
 @dataclass(frozen=True, eq=False)
 class _Layer:
     """Of points: float64 [P], how thick fluid lies on them, and unit vectors [P, 3] to its surface."""
@@ -196,30 +219,60 @@ def _refined(surface: Surface, puddle: Puddle) -> Refined:
     )
 
 
-def _layer(puddle: Puddle, fine: Refined, normals: np.ndarray) -> _Layer:
+def _layer(puddle: Puddle, fine: Refined, normals: np.ndarray, room_mm: Room) -> _Layer:
     graph = spread.edges_of(fine.rest, fine.triangles)
     start = int(np.linalg.norm(fine.rest - puddle.start_mm, axis=1).argmin())
     far_mm = spread.along_mesh(graph, start, puddle.reach_mm)
-    if puddle.pool:
-        up = -puddle.down
-        height_mm = fine.rest @ up
-        lowest = int(np.where(far_mm < puddle.size_mm / 2, height_mm, np.inf).argmin())
-        about_mm = spread.along_mesh(graph, lowest, puddle.size_mm / 2)
-        allowed = (about_mm < puddle.size_mm / 2) & (far_mm < puddle.reach_mm) & (normals @ up > FLOOR)
-        depth_mm = spread.pool_mm(height_mm, allowed, graph, lowest, puddle.thickness_mm)
-        depth_mm[depth_mm < LEAST_MM] = 0
-        return _Layer(depth_mm * (depth_mm.max() > SHALLOWEST_MM), np.broadcast_to(up, normals.shape))
-    run = unit(puddle.down - (puddle.down @ normals[start]) * normals[start])
-    ragged, uneven = (spread.noise(puddle.size_mm, run, puddle.generator)(fine.rest) for _ in range(2))
-    share = SPREADS[puddle.spread](spread.within(far_mm, puddle.size_mm, ragged), uneven)
-    towards = normals
-    if puddle.spread == "lumps":
-        axis = unit((share[:, None] * normals).sum(axis=0))
-        share = share * smoothstep((normals @ axis - 0.2) / 0.4)
-        towards = np.broadcast_to(axis, normals.shape)
-    thickness_mm = puddle.thickness_mm * share
+    layer = _standing if puddle.pool else _adhering
+    thickness_mm, towards = layer(puddle, fine, normals, room_mm, graph, far_mm)
     thickness_mm[thickness_mm < LEAST_MM] = 0
     return _Layer(thickness_mm, towards)
+
+
+def _standing(
+    puddle: Puddle,
+    fine: Refined,
+    normals: np.ndarray,
+    room_mm: Room,
+    graph: scipy.sparse.csr_array,
+    far_mm: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Depth [P] of a pool, and its way up, [P, 3]. Where wall hangs over it too low, it runs off."""
+    up = np.broadcast_to(-puddle.down, normals.shape)
+    inside = (far_mm < puddle.size_mm / 2) & (dot(normals, up) > FLOOR)
+    above_mm = np.zeros(len(normals))
+    above_mm[inside] = room_mm(fine.rest[inside], up[inside])
+    for _ in range(len(normals)):
+        depth_mm = spread.pool_mm(dot(fine.rest, up), inside, graph, puddle.thickness_mm)
+        low = ROOM * depth_mm > above_mm
+        if not low.any():
+            break
+        inside &= ~low
+    holds = depth_mm.max() > SHALLOWEST_MM and np.count_nonzero(depth_mm) > FEWEST
+    return depth_mm * holds, up
+
+
+def _adhering(
+    puddle: Puddle,
+    fine: Refined,
+    normals: np.ndarray,
+    room_mm: Room,
+    graph: scipy.sparse.csr_array,
+    far_mm: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Thickness [P] of what adheres, and the way it rises, [P, 3]."""
+    down = puddle.down - dot(puddle.down, normals[far_mm.argmin()]) * normals[far_mm.argmin()]
+    ragged, uneven = (spread.noise(puddle.size_mm, unit(down), puddle.generator)(fine.rest) for _ in range(2))
+    share = SPREADS[puddle.spread](spread.within(far_mm, puddle.size_mm, ragged), uneven)
+    if puddle.spread == "lumps":
+        axis = unit((share[:, None] * normals).sum(axis=0))
+        steep = smoothstep((normals @ axis - 0.2) / 0.4)
+        return puddle.thickness_mm * share * steep, np.broadcast_to(axis, normals.shape)
+    thickness_mm = puddle.thickness_mm * share
+    wet = thickness_mm > 0
+    room = room_mm(fine.rest[wet], normals[wet])
+    thickness_mm[wet] = np.minimum(thickness_mm[wet], CREASE * room)
+    return thickness_mm, normals
 
 
 def _levelled(

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from itertools import islice
 from dataclasses import dataclass, field
 
 import numpy as np
 import scipy.sparse
+from scipy.spatial import cKDTree
 
 from endotwin.anatomy.optics import MUCUS, STOOL, WHOLE_BLOOD, Optics, blood
-from endotwin.anatomy.wet import Puddle, Wetted
+from endotwin.anatomy.wet import Puddle, Wetted, hollows_mm
 from endotwin.cameras import Camera
 from endotwin.errors import OptionError, TwinError
 from endotwin.run.streams import Stream
@@ -27,11 +29,11 @@ SMALLEST_MM, LARGEST_MM = 2.0, 60.0
 POOL_MM = 2.5
 """Depth of a pool unless another is asked for."""
 
-TRIES = 60
+TRIES = 30
 """Places that are tried for one patch."""
 
-LEVEL = 0.5
-"""Least cosine between the wall and the vertical where a pool is sought by chance."""
+HOLLOW_MM = 0.3
+"""Depth to which a place must hold fluid for a pool that is put there by chance."""
 
 
 @dataclass(frozen=True)
@@ -142,10 +144,8 @@ def _spill(
     """Let one patch lie on the wall, at a place that suits it."""
     found = FLUIDS[kind]
     shape = int(generator.integers(2**63))
-    fault, tried = "no wall is seen", 0
-    for point, normal in wall.places(f"fluid {spec!r}", options, generator):
-        if options.pool and not options.placed and -normal @ down < LEVEL:
-            continue
+    fault, tried = "no such wall is seen", 0
+    for point in _places(wall, wetted.twin, f"fluid {spec!r}", options, down, generator):
         puddle = Puddle(
             kind,
             found.optics if kind != "blood" else blood(options.haemoglobin),
@@ -159,7 +159,22 @@ def _spill(
         fault, tried = wetted.add(puddle), tried + 1
         if not fault:
             return
-        if tried == TRIES:
-            break
     where = "there" if options.placed else f"at any of {tried} places"
     raise OptionError(f"fluid {spec!r} cannot lie {where}: {fault}; choose another place, or a smaller size")
+
+
+def _places(
+    wall: Wall,
+    twin: Twin,
+    what: str,
+    options: FluidOptions,
+    down: np.ndarray,
+    generator: np.random.Generator,
+) -> Iterator[np.ndarray]:
+    """Points [3] of the wall to try, in the surface's frame: of a pool without a place, in hollows."""
+    points = (point for point, _ in wall.places(what, options, generator))
+    if options.pool and not options.placed:
+        deep = hollows_mm(twin.surface, down) > HOLLOW_MM
+        nearest = cKDTree(twin.surface.vertices_mm)
+        points = (point for point in points if deep[nearest.query(point)[1]])
+    return islice(points, TRIES)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field
+from itertools import islice
 
 import numpy as np
 import scipy.sparse
@@ -23,6 +24,9 @@ from endotwin.twin import Twin
 from endotwin.twin.polyps import MOST_POLYPS
 
 SMALLEST_MM, LARGEST_MM = 1.0, 50.0
+
+TRIES = 400
+"""Places that are tried for one polyp."""
 
 
 @dataclass(frozen=True)
@@ -58,6 +62,8 @@ def with_polyps(
     """
     if not twin.fitted:
         raise TwinError("the twin has no materials yet; run 'endotwin fit' on it first")
+    if twin.fluids:
+        raise OptionError("fluids lie on this twin already; grow polyps on the one without them")
     asked = [(spec, *parse_polyp(spec)) for spec in ([specs] if isinstance(specs, str) else specs)]
     if len(twin.polyps) + sum(options.count for *_, options in asked) > MOST_POLYPS:
         raise OptionError(f"a twin holds {MOST_POLYPS} polyps at most; ask for fewer")
@@ -108,7 +114,8 @@ class _Garden:
         height_mm = options.height or CLASSES[kind].usual_height_mm(options.size)
         shape = Shape.drawn(kind, options.size, height_mm, generator)
         fault = "no wall is seen"
-        for point, normal in self._wall.places(f"polyp {spec!r}", options, generator):
+        places = self._wall.places(f"polyp {spec!r}", options, generator)
+        for point, normal in islice(places, TRIES):
             site = Site.at(point, normal, shape.radius_mm, self._caster)
             fault = self._fault(shape, site, options.placed)
             if not fault:

@@ -26,9 +26,6 @@ FACING = 0.35
 FARTHEST_MM = 60.0
 """Of a place drawn by chance, from a pose that sees it."""
 
-TRIES = 400
-"""Places that are tried for one thing."""
-
 OFF_MM = 2.0
 """A point that is given lies on the wall if it is no farther from it."""
 
@@ -60,7 +57,7 @@ class Wall:
             yield surface.vertices_mm[nearest].astype(np.float64), surface.normals[nearest]
             return
         points, normals = self._seen
-        for k in generator.permutation(len(points))[:TRIES]:
+        for k in generator.permutation(len(points)):
             yield points[k], normals[k]
 
     @cached_property
