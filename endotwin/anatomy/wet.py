@@ -43,6 +43,9 @@ WET_MM = 0.05
 ROOM = 1.2
 """A layer needs so many times its thickness above it."""
 
+CROWDED_MM, CROWDED = 0.3, 0.01
+"""Wall that has other wall so near above it, in more than this share of the patch, is no single layer."""
+
 CREASE = 0.3
 """A film on both walls of a crease is no thicker than this share of the way between them."""
 
@@ -119,12 +122,14 @@ class Wetted:
         return self._caster.cast_rays(start, towards.astype(np.float32))[2]
 
     def _fault(self, puddle: Puddle, fine: Refined, layer: _Layer, on: np.ndarray) -> str:
-        if not on.any():
-            return "it would run off" if puddle.pool else "the mesh is too coarse"
+        if on.sum() < EDGES:
+            return "it would run off" if puddle.pool else "the wall there is not whole"
         if self._fluids[fine.origin[on]].any():
             return "another fluid lies there"
         thick = layer.thickness_mm > 0
         room_mm = self._room_mm(fine.rest[thick], layer.towards[thick])
+        if (room_mm < CROWDED_MM).mean() > CROWDED:
+            return "the wall there lies in layers"
         free = ROOM * layer.thickness_mm[thick] < room_mm
         return "" if free.all() else "the lumen is too narrow there"
 

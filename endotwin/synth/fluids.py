@@ -25,6 +25,7 @@ from endotwin.twin import Twin
 from endotwin.twin.fluids import MOST_FLUIDS
 
 SMALLEST_MM, LARGEST_MM = 2.0, 60.0
+THINNEST_MM = 0.01
 
 POOL_MM = 2.5
 """Depth of a pool unless another is asked for."""
@@ -123,8 +124,8 @@ def parse_fluid(spec: str) -> tuple[str, FluidOptions]:
     if not SMALLEST_MM <= options.size <= LARGEST_MM:
         raise OptionError(f"fluid {spec!r}: its size lies between {SMALLEST_MM:g} and {LARGEST_MM:g} mm")
     most_mm = options.size / 2 if options.pool else FLUIDS[kind].most_mm
-    if options.thickness > most_mm:
-        raise OptionError(f"fluid {spec!r}: its thickness is at most {most_mm:g} mm")
+    if options.thickness and not THINNEST_MM <= options.thickness <= most_mm:
+        raise OptionError(f"fluid {spec!r}: its thickness lies between {THINNEST_MM:g} and {most_mm:g} mm")
     if options.count < 1 or (options.placed and options.count > 1):
         raise OptionError(f"fluid {spec!r}: count is at least 1, and 1 where a place is given")
     if options.haemoglobin != WHOLE_BLOOD and kind != "blood":
