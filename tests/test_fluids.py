@@ -303,8 +303,9 @@ def test_without_fluids_nothing_of_them_is_written(bare):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("motion", [(), ("peristalsis:amplitude=1,width=0.1", "breathing:amplitude=2")])
-def test_a_dataset_with_fluids_is_proved(folded, tmp_path, motion):
+def test_a_dataset_with_fluids_is_proved(tmp_path, motion):
     path = np.stack([*poses(), *(tube_twin.pose(s) for s in (0.33, 0.34))])
+    folded = tube_twin.fitted(tube_twin.seen(tube_twin.surface(fold_mm=3)))
     twin = replace(folded, camera=folded.camera.scaled(2))
     choices = {"fluids": SEVERAL, "motion": motion, "labels": "all", "seed": 1}
     endotwin.synthesize(twin, path, tmp_path / "d", **choices)

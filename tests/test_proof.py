@@ -38,7 +38,7 @@ def twin() -> Twin:
     """A tube with folds that hide each other, a polyp and a film of blood."""
     tube = tube_twin.fitted(tube_twin.seen(tube_twin.surface(fold_mm=3.0)))
     grown = with_polyps(tube, "Is:size=4", 0, trajectory())[0]
-    return with_fluids(grown, "blood:size=8", 0, trajectory())[0]
+    return with_fluids(grown, "blood:size=14,thickness=0.05", 0, trajectory())[0]
 
 
 def rendered(folder: Path, **options) -> Path:
