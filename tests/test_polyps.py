@@ -366,7 +366,7 @@ def test_a_painted_region_stays_where_it_was_painted(bare, tmp_path):
     )
     from endotwin import pipeline
 
-    wanted = ("Is:size=4", "rgb", "c3vd", None, 0)
+    wanted = ("Is:size=4", (), "rgb", "c3vd", None, 0)
     job = pipeline._job(bare, poses(), (), (), tmp_path / "vary.yaml", None, None, (), *wanted)
     (region,) = job.regions
     assert len(region.weight) == len(job.twin.surface.vertices_mm) > len(half)

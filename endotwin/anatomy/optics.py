@@ -90,5 +90,5 @@ def blood(haemoglobin: float) -> Optics:
 MUCUS = Optics.of_thick((0.86, 0.82, 0.66), 0.9, 0.2)
 """Whitish and yellowish, half transparent at the thickness of a film: free parameters, chosen by eye."""
 
-STOOL = Optics.of_thick((0.3, 0.16, 0.045), 8.0, 0.5)
+STOOL = Optics.of_thick((0.3, 0.138, 0.034), 8.0, 0.5)
 """Brown-yellow, opaque from some tenths of a millimetre on: free parameters, chosen by eye."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from heapq import heapify, heappop, heappush
 
 import numpy as np
@@ -12,8 +13,11 @@ from scipy.sparse.csgraph import connected_components, dijkstra
 from endotwin.anatomy.shape import smoothstep
 
 WAVES = 24
-FINE, COARSE = 0.05, 0.9
-"""Wavelengths of what makes a film uneven, in sizes."""
+LONGEST = 0.9
+"""Greatest wavelength of what makes a film uneven, in sizes."""
+
+RAGGEDNESS = 0.06
+"""Least wavelength of its edge, as a share of that."""
 
 RUN = 2.0
 """How many times longer its pattern is along the way it ran."""
@@ -36,14 +40,15 @@ def along_mesh(graph: scipy.sparse.csr_array, start: int, limit_mm: float) -> np
 
 
 def noise(
-    size_mm: float, run: np.ndarray, generator: np.random.Generator
+    longest_mm: float, finest: float, run: np.ndarray, generator: np.random.Generator
 ) -> Callable[[np.ndarray], np.ndarray]:
-    """A pattern of points [P, 3], of mean 0 and standard deviation 1, drawn by chance: plane waves whose
-    amplitudes are as the square root of their lengths, stretched along the unit vector ``run`` [3]."""
+    """A pattern of points [P, 3], of mean 0 and standard deviation 1, drawn by chance: plane waves of up to
+    ``longest_mm``, and down to the share ``finest`` of that, whose amplitudes are as the square root of their
+    lengths, stretched along the unit vector ``run`` [3]."""
     directions = generator.standard_normal((WAVES, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     directions -= (1 - 1 / RUN) * (directions @ run)[:, None] * run
-    lengths_mm = size_mm * np.geomspace(FINE, COARSE, WAVES)
+    lengths_mm = longest_mm * np.geomspace(finest, 1, WAVES)
     offsets = generator.uniform(0, 2 * np.pi, WAVES)
     amplitudes = np.sqrt(2 * lengths_mm / lengths_mm.sum())
     waves = 2 * np.pi * directions / lengths_mm[:, None]
@@ -55,6 +60,15 @@ def within(far_mm: np.ndarray, size_mm: float, pattern: np.ndarray) -> np.ndarra
     swings with a ``pattern`` [P]; nothing of it is farther than half its size along the mesh."""
     reach = 1 - 2 * np.minimum(far_mm / size_mm, 1)
     return np.minimum(1.5 * reach - RAGGED / 2 + RAGGED * pattern, 4 * reach)
+
+
+@dataclass(frozen=True)
+class Spread:
+    """How something adheres: the share of its thickness that it has, by how far inside points are and a
+    pattern, [P] each; and the least wavelength of that pattern, as a share of the longest."""
+
+    share: Callable[[np.ndarray, np.ndarray], np.ndarray]
+    finest: float
 
 
 def film(inside: np.ndarray, pattern: np.ndarray) -> np.ndarray:
@@ -69,7 +83,11 @@ def strands(inside: np.ndarray, pattern: np.ndarray) -> np.ndarray:
 
 def lumps(inside: np.ndarray, pattern: np.ndarray) -> np.ndarray:
     """As ``film``, of what holds its shape: domes with bumps."""
-    return smoothstep(inside / 0.9) ** 0.7 * (0.55 + 0.45 * smoothstep(0.5 + 0.3 * pattern))
+    return smoothstep(inside / 1.2) ** 0.7 * (0.4 + 0.6 * smoothstep(0.5 + 0.3 * pattern))
+
+
+SPREADS = {"film": Spread(film, 0.06), "strands": Spread(strands, 0.06), "lumps": Spread(lumps, 0.3)}
+"""By name."""
 
 
 def pool_mm(

@@ -52,8 +52,6 @@ CREASE = 0.3
 CLEAR_MM = 0.01
 """Above the mesh, to where a ray leaves it for sure."""
 
-SPREADS = {"film": spread.film, "strands": spread.strands, "lumps": spread.lumps}
-
 Room = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
 MOST_POINTS = 2000
@@ -65,7 +63,7 @@ class Puddle:
     """A patch of fluid to be.
 
     Attributes:
-        kind: its name. optics: of the fluid. spread: how it lies: one of SPREADS, or ``pool``.
+        kind: its name. optics: of the fluid. spread: how it lies: one of ``spread.SPREADS``, or ``pool``.
         size_mm: greatest extent along the mesh. thickness_mm: greatest, of a pool its greatest depth.
         down: unit vector [3] along gravity. start_mm: [3], where it spreads from, in the surface's frame.
         generator: of its shape.
@@ -267,8 +265,12 @@ def _adhering(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Thickness [P] of what adheres, and the way it rises, [P, 3]."""
     down = puddle.down - dot(puddle.down, normals[far_mm.argmin()]) * normals[far_mm.argmin()]
-    ragged, uneven = (spread.noise(puddle.size_mm, unit(down), puddle.generator)(fine.rest) for _ in range(2))
-    share = SPREADS[puddle.spread](spread.within(far_mm, puddle.size_mm, ragged), uneven)
+    found, longest_mm = spread.SPREADS[puddle.spread], spread.LONGEST * puddle.size_mm
+    ragged, uneven = (
+        spread.noise(longest_mm, finest, unit(down), puddle.generator)(fine.rest)
+        for finest in (spread.RAGGEDNESS, found.finest)
+    )
+    share = found.share(spread.within(far_mm, puddle.size_mm, ragged), uneven)
     if puddle.spread == "lumps":
         axis = unit((share[:, None] * normals).sum(axis=0))
         steep = smoothstep((normals @ axis - 0.2) / 0.4)

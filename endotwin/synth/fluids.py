@@ -39,8 +39,8 @@ HOLLOW_MM = 0.3
 
 @dataclass(frozen=True)
 class FluidKind:
-    """One fluid: for people; how it adheres (see ``anatomy.wet.SPREADS``), how thick it is then, mm, and the
-    greatest thickness that may be asked for; its optics."""
+    """One fluid: what it is, for people; how it adheres (see ``anatomy.spread.SPREADS``), how thick it is
+    then, mm, and how thick it may be; its optics."""
 
     words: str
     spread: str
