@@ -39,10 +39,9 @@ HOLLOW_MM = 0.3
 
 @dataclass(frozen=True)
 class FluidKind:
-    """One fluid: what it is, for people; how it adheres (see ``anatomy.spread.SPREADS``), how thick it is
-    then, mm, and how thick it may be; its optics."""
+    """One fluid: how it adheres (see ``anatomy.spread.SPREADS``), how thick it is then, mm, and how thick it
+    may be; its optics."""
 
-    words: str
     spread: str
     usual_mm: float
     most_mm: float
@@ -50,9 +49,9 @@ class FluidKind:
 
 
 FLUIDS = {
-    "blood": FluidKind("a red film, or a pool", "film", 0.25, 1.0, blood(WHOLE_BLOOD)),
-    "mucus": FluidKind("a whitish, half transparent film in threads", "strands", 0.4, 1.0, MUCUS),
-    "stool": FluidKind("brown-yellow opaque lumps, or a pool", "lumps", 1.2, 4.0, STOOL),
+    "blood": FluidKind("film", 0.25, 1.0, blood(WHOLE_BLOOD)),
+    "mucus": FluidKind("strands", 0.4, 1.0, MUCUS),
+    "stool": FluidKind("lumps", 1.2, 4.0, STOOL),
 }
 """By name."""
 
