@@ -15,7 +15,8 @@ from endotwin.run.output import DATASET, check_apart, check_free, check_picture
 LABELS = (
     "rgb, rgb_linear, rgb_exr, depth, depth_exr, normals, mask, albedo, roughness, metallic, diffuse, "
     "specular, flow, flow_forward, flow_exr, flow_npz, flow_forward_exr, flow_forward_npz, occlusion, "
-    "triangles, overlay; of polyps polyp; of motion scene_flow, scene_flow_forward, vertices; 'all'"
+    "triangles, overlay; of polyps polyp; of fluids fluid; of motion scene_flow, scene_flow_forward, "
+    "vertices; 'all'"
 )
 
 
@@ -39,7 +40,7 @@ def synth(
         typer.Option(
             metavar="NAMES",
             help=f"What to write, joined by commas: {LABELS}.",
-            show_default="rgb,depth,normals,mask, and polyp where some grow",
+            show_default="rgb,depth,normals,mask, and polyp or fluid where there are some",
         ),
     ] = None,
     layout: Annotated[
@@ -91,8 +92,18 @@ def synth(
         list[str] | None,
         typer.Option(
             metavar="CLASS:…",
-            help="Grow polyps on the wall, of the Paris classes Ip (on a stalk), Is (sessile) or IIa (flat): "
+            help="Grow polyps on the wall, of the Paris classes Ip (on a stalk), Is (sessile), IIa (slightly "
+            "elevated), IIb (flat) or IIc (slightly depressed): "
             "'Is:size=6,height=…,count=3,ihb=…', at random where the trajectory sees the wall, or at "
+            "'x=…,y=…,z=…' or 'frame=…,u=…,v=…'; may be repeated.",
+        ),
+    ] = None,
+    fluid: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="KIND:…",
+            help="Let fluid lie on the wall, blood, mucus or stool: 'blood:size=12,thickness=…,count=2,…' "
+            "or, level in a hollow, 'stool:pool=true', at random where the trajectory sees the wall, or at "
             "'x=…,y=…,z=…' or 'frame=…,u=…,v=…'; may be repeated.",
         ),
     ] = None,
@@ -155,6 +166,7 @@ def synth(
             "effects": parse_states(effects, like=True),
             "motion": motion or (),
             "polyps": polyp or (),
+            "fluids": fluid or (),
         }
         choices |= {"limits": limits, "seed": seed, "overwrite": overwrite}
         with run.stage("synth"):

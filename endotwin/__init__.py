@@ -24,6 +24,7 @@ _HOME = {
     "inspect": "look.inspector",
     "open_sequence": "sequence.readers",
     "synthesize": "pipeline",
+    "with_fluids": "pipeline",
     "with_polyps": "pipeline",
 }
 

@@ -174,6 +174,8 @@ def _as_recorded(twin: Twin | Path | str) -> Twin:
     twin = as_twin(twin)
     if twin.polyps:
         raise TwinError("polyps were grown on this twin, and its photos show none: take the one without them")
+    if twin.fluids:
+        raise TwinError("fluids lie on this twin, and its photos show none: take the one without them")
     return twin
 
 
@@ -189,6 +191,7 @@ def synthesize(
     effects: Mapping[str, str] | None = None,
     motion: Iterable[str] | str = (),
     polyps: Iterable[str] | str = (),
+    fluids: Iterable[str] | str = (),
     labels: Iterable[str] | str | None = None,
     layout: str = "c3vd",
     limits: Limits | None = None,
@@ -214,6 +217,8 @@ def synthesize(
             ``endotwin.synth.parse_motion``).
         polyps: that grow on the wall, such as ``Is:size=6,count=3`` or ``Ip:size=10``, one or several; places
             that are not given are drawn where the trajectory sees the wall.
+        fluids: that lie on it, such as ``blood:size=12`` or ``stool:pool=true``, one or several, at places as
+            those of polyps.
         labels: names such as ``rgb,depth`` (see ``endotwin.synth.LABELS``), or ``all``.
         layout: one of ``endotwin.synth.LAYOUTS``.
         limits: what a pose must keep to be rendered.
@@ -230,7 +235,7 @@ def synthesize(
     """
     from endotwin.synth import render_dataset
 
-    wanted = (motion, polyps, labels, layout, limits, seed)
+    wanted = (motion, polyps, fluids, labels, layout, limits, seed)
     job = _job(twin, trajectory, material, light, vary, camera, effects, *wanted)
     return render_dataset(job, out, workers, scheduler, overwrite, progress)
 
@@ -247,7 +252,8 @@ def with_polyps(
 
     Args:
         twin: or its folder.
-        polyps: one such as ``Is:size=6,count=3`` (classes Ip, Is and IIa of the Paris workshop), or several.
+        polyps: one such as ``Is:size=6,count=3`` (classes Ip, Is, IIa, IIb and IIc of the Paris
+            workshop), or several.
         trajectory: that sees the places which are not given, as of ``synthesize``; without one, they are
             anywhere on wall that the training photos show.
         seed: of shapes and places. limits: of the trajectory's poses.
@@ -264,6 +270,35 @@ def with_polyps(
     return synth.with_polyps(twin, polyps, seed, poses)[0]
 
 
+def with_fluids(
+    twin: Twin | Path | str,
+    fluids: Iterable[str] | str,
+    *,
+    trajectory: str | Path | np.ndarray | None = None,
+    seed: int = 0,
+    limits: Limits | None = None,
+) -> Twin:
+    """A fitted twin with fluids on its wall, which can be rendered, saved and exported as any other.
+
+    Args:
+        twin: or its folder; polyps grow on it before fluids lie there.
+        fluids: one such as ``blood:size=12`` (blood, mucus or stool), or several.
+        trajectory: that sees the places which are not given, as of ``synthesize``; without one, they are
+            anywhere on wall that the training photos show.
+        seed: of shapes and places. limits: of the trajectory's poses.
+
+    Raises:
+        TwinError: the twin is not fitted. OptionError: a fluid is not understood, or finds no place.
+    """
+    from endotwin import synth
+
+    twin = as_twin(twin)
+    poses = None
+    if trajectory is not None:
+        poses = synth.parse_trajectory(trajectory, twin, seed, twin.camera, limits)
+    return synth.with_fluids(twin, fluids, seed, poses)[0]
+
+
 def preview(
     twin: Twin | Path | str,
     trajectory: str | Path | np.ndarray,
@@ -276,6 +311,7 @@ def preview(
     effects: Mapping[str, str] | None = None,
     motion: Iterable[str] | str = (),
     polyps: Iterable[str] | str = (),
+    fluids: Iterable[str] | str = (),
     limits: Limits | None = None,
     seed: int = 0,
     overwrite: bool = False,
@@ -287,7 +323,7 @@ def preview(
     """
     from endotwin.look import preview as draw
 
-    wanted = (motion, polyps, "rgb", "c3vd", limits, seed)
+    wanted = (motion, polyps, fluids, "rgb", "c3vd", limits, seed)
     job = _job(twin, trajectory, material, light, vary, camera, effects, *wanted)
     return draw.preview(job, out, overwrite)
 
@@ -302,6 +338,7 @@ def _job(
     effects: Mapping[str, str] | None,
     motion: Iterable[str] | str,
     polyps: Iterable[str] | str,
+    fluids: Iterable[str] | str,
     labels: Iterable[str] | str | None,
     layout: str,
     limits: Limits | None,
@@ -317,15 +354,16 @@ def _job(
     variation = synth.fixed(edits, [synth.parse_light_edit(edit) for edit in light])
     if vary:
         variation = synth.read_variation(Path(vary), twin, variation)
-    grows = bool(polyps or twin.polyps)
-    chosen = (*synth.DEFAULT_LABELS, *(("polyp",) if grows else ()))
+    grows, wet = bool(polyps or twin.polyps), bool(fluids or twin.fluids)
+    chosen = (*synth.DEFAULT_LABELS, *(("polyp",) if grows else ()), *(("fluid",) if wet else ()))
     if labels is not None:
         labels = labels if isinstance(labels, str) else ",".join(labels)
-        chosen = synth.parse_labels(labels, bool(motion), grows)
+        chosen = synth.parse_labels(labels, bool(motion), grows, wet)
     poses = synth.parse_trajectory(trajectory, twin, seed, lens, limits)
-    if polyps:
-        twin, weights = synth.with_polyps(twin, polyps, seed, poses, lens)
-        variation, poses = variation.carried(weights), synth.kept_in(poses, twin, lens)
+    for added, specs in ((synth.with_polyps, polyps), (synth.with_fluids, fluids)):
+        if specs:
+            twin, weights = added(twin, specs, seed, poses, lens)
+            variation, poses = variation.carried(weights), synth.kept_in(poses, twin, lens)
     moving = synth.parse_motion(motion, twin)
     if moving:
         poses = moving.carried(poses)

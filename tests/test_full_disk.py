@@ -20,6 +20,7 @@ COMMANDS = {
     "eval with a profile": ("profile.json", "eval read_only --profile profile.json"),
     "synth": ("new", "synth twin --trajectory jitter:frames=2 -o new"),
     "synth of tars": ("new", "synth twin --trajectory jitter:frames=2 --layout webdataset -o new"),
+    "synth of fluids": ("new", "synth twin --trajectory jitter:frames=2 --fluid blood:size=4 -o new"),
     "synth of polyps": ("new", "synth twin --trajectory jitter:frames=2 --polyp IIa:size=3 -o new"),
     "preview": ("new.png", "synth twin --trajectory jitter:frames=2 --preview new.png"),
     "inspect": ("new.png", "inspect twin --screenshot new.png --map base_color"),

@@ -239,7 +239,7 @@ def test_a_dataset_of_still_tissue_says_nothing_of_motion(twin, tmp_path):
     synthesize(twin, Trajectory(poses(), TIMES_S, "three poses"), tmp_path / "d", labels=("depth",))
     assert "motion" not in json.loads((tmp_path / "d" / "dataset.json").read_text())
     assert not {"scene_flow", "vertices"} & set(parse_labels("all"))
-    assert set(parse_labels("all", moving=True, polyps=True)) == set(LABELS)
+    assert set(parse_labels("all", moving=True, polyps=True, fluids=True)) == set(LABELS)
 
 
 def test_triangles_that_pass_through_each_other_are_found():

@@ -15,7 +15,7 @@ from scipy.spatial.distance import pdist
 import endotwin
 import endotwin.synth
 from endotwin.anatomy import CLASSES
-from endotwin.anatomy.classes import JAWS_MM
+from endotwin.anatomy.classes import DEEPEST_MM, JAWS_MM
 from endotwin.errors import OptionError, TrajectoryError, TwinError
 from endotwin.light.film import Film
 from endotwin.surface.casting import Caster
@@ -31,6 +31,7 @@ from endotwin.twin import Twin
 from endotwin.twin.polyps import Polyp
 
 SIZES = [("Ip", 4.0), ("Ip", 7.0), ("Is", 3.0), ("Is", 6.0), ("IIa", 4.0), ("IIa", 9.0)]
+SIZES += [("IIb", 4.0), ("IIb", 8.0), ("IIc", 4.0), ("IIc", 8.0)]
 SEVERAL = ["Is:size=4,count=2", "Ip:size=4", "IIa:size=5"]
 
 
@@ -90,20 +91,27 @@ def test_a_polyp_is_as_high_above_the_true_wall_as_its_class_says(one):
     points = twin.surface.vertices_mm[twin.surface.triangles[first : first + count]].reshape(-1, 3)
     _, inward = tube_twin.to_axis(points + twin.surface.origin_mm)
     risen_mm = np.max(tube_twin.RADIUS_MM - np.linalg.norm(inward, axis=1))
-    assert polyp.height_mm == pytest.approx(risen_mm, rel=0.05)
+    if kind in ("IIb", "IIc"):
+        inward_mm = tube_twin.RADIUS_MM - np.linalg.norm(inward, axis=1)
+        risen_mm = inward_mm[np.abs(inward_mm).argmax()]
+    assert polyp.height_mm == pytest.approx(risen_mm, rel=0.05, abs=0.02)
     assert polyp.height_mm == pytest.approx(CLASSES[kind].usual_height_mm(size_mm), rel=0.02)
-    assert {"Ip": top > size_mm, "Is": top > JAWS_MM, "IIa": top < JAWS_MM}[kind]
+    told = {"Ip": top > size_mm, "Is": top > JAWS_MM, "IIa": top < JAWS_MM}
+    told |= {"IIb": polyp.height_mm == 0, "IIc": -DEEPEST_MM < polyp.height_mm < 0}
+    assert told[kind]
 
 
 def test_a_pedunculated_polyp_has_a_stalk_and_others_none(one):
     kind, _, twin, polyp = one
     mesh = mesh_of(twin, polyp)
+    if polyp.height_mm <= 0:
+        return
     low, high = widths_mm(mesh, np.array([0.3, 0.7]) * polyp.height_mm)
     assert low < 0.5 * high if kind == "Ip" else low > 0.95 * high
 
 
 def test_the_mesh_stays_a_tube_without_seams(one, bare):
-    *_, twin, _ = one
+    *_, twin, polyp = one
     before, after = (
         trimesh.Trimesh(each.surface.vertices_mm, each.surface.triangles, process=False)
         for each in (bare, twin)
@@ -114,7 +122,8 @@ def test_the_mesh_stays_a_tube_without_seams(one, bare):
     assert shared.max() == 2
     assert (shared == 1).sum() == len(trimesh.grouping.group_rows(before.edges_sorted, require_count=1))
     assert after.area_faces.min() > 0
-    assert len(crossings(twin.surface)) < 3, "a ray within the plane of a facet may be told to meet it"
+    if polyp.height_mm:  # a flat one's facets lie in one plane with those that they were cut from
+        assert len(crossings(twin.surface)) < 3, "a ray within the plane of a facet may be told to meet it"
 
 
 def test_the_polyp_is_smooth(one):
@@ -153,6 +162,38 @@ def test_the_wall_elsewhere_is_unchanged_bit_for_bit(one, bare):
     kept[kept] = away[twin.surface.triangles[kept]].all(axis=1)
     np.testing.assert_array_equal(twin.surface.triangles[kept], bare.surface.triangles[whole])
     assert (~away).sum() < 0.1 * count
+
+
+def test_a_flat_lesion_changes_colours_and_no_shape(bare):
+    """Every ray meets the surface of before at the same depth, with the same normal."""
+    twin, _ = with_polyps(bare, f"IIb:size=7,{on_the_wall(0.8)}", seed=3)
+    count = len(bare.surface.vertices_mm)
+    for name in ("vertices_mm", "normals"):
+        before, after = getattr(bare.surface, name), getattr(twin.surface, name)
+        np.testing.assert_array_equal(after[:count], before)
+    (before, after), own = (
+        [Labeller(job_of(each, "depth_exr,normals,albedo")).frame(0) for each in (bare, twin)],
+        Labeller(job_of(twin, "polyp")).frame(0)["polyp"] > 0,
+    )
+    assert own.sum() > 100
+    np.testing.assert_allclose(after["depth_exr"], before["depth_exr"], rtol=1e-5)
+    np.testing.assert_allclose(after["normals"], before["normals"], atol=1e-3)
+    assert (np.abs(after["albedo"] - before["albedo"]).max(axis=2) > 5e-3)[own].mean() > 0.9
+
+
+def test_depth_follows_a_depressed_lesion(bare):
+    """Where its floor is seen, the wall is farther by its depth over the cosine of the ray to it."""
+    spec = f"IIc:size=8,height=-0.9,{on_the_wall(0.8)}"
+    twin, _ = with_polyps(bare, spec, seed=3)
+    at_rest, sunk = (Caster(each.surface) for each in (bare, twin))
+    foot, axis = np.array(twin.polyps[0].place_mm) - twin.surface.origin_mm, np.array(twin.polyps[0].axis)
+    start, towards = (foot + 5 * axis).astype(np.float32)[None], -axis.astype(np.float32)[None]
+    before_mm, after_mm = (caster.cast_rays(start, towards)[2][0] for caster in (at_rest, sunk))
+    assert after_mm - before_mm == pytest.approx(0.9, abs=0.15)
+    depths = [Labeller(job_of(each, "depth_exr")).frame(0)["depth_exr"] for each in (bare, twin)]
+    own = Labeller(job_of(twin, "polyp")).frame(0)["polyp"] > 0
+    assert (depths[1] - depths[0])[own].min() > -0.05
+    assert (depths[1] - depths[0])[own].max() > 0.5
 
 
 def test_haemoglobin_reddens_by_its_index(bare):
@@ -325,7 +366,7 @@ def test_a_painted_region_stays_where_it_was_painted(bare, tmp_path):
     )
     from endotwin import pipeline
 
-    wanted = ("Is:size=4", "rgb", "c3vd", None, 0)
+    wanted = ("Is:size=4", (), "rgb", "c3vd", None, 0)
     job = pipeline._job(bare, poses(), (), (), tmp_path / "vary.yaml", None, None, (), *wanted)
     (region,) = job.regions
     assert len(region.weight) == len(job.twin.surface.vertices_mm) > len(half)
@@ -346,7 +387,9 @@ def test_poses_that_a_polyp_comes_too_near_to_are_dropped(bare, tmp_path):
 @pytest.mark.parametrize(
     ("spec", "said"),
     [
-        ("III", "no known class; write Ip or Is or IIa"),
+        ("III", "no known class; write Ip or Is or IIa or IIb or IIc"),
+        ("IIb:height=1", "0 to 0 mm high"),
+        ("IIc:size=20,height=-1.5", "-1.2 to 0 mm high"),
         ("Is:size=0.2", "size lies between 1 and 50 mm"),
         ("Is:size=2", "higher than 2.5 mm"),
         ("IIa:size=9,height=3", "0 to 2.5 mm high"),

@@ -13,7 +13,7 @@ from command_line import invoke
 
 from endotwin.errors import SequenceError
 from endotwin.sequence.images import read_color
-from endotwin.synth import LAYOUTS, Trajectory, parse_labels, prove, synthesize, with_polyps
+from endotwin.synth import LAYOUTS, Trajectory, parse_labels, prove, synthesize, with_fluids, with_polyps
 from endotwin.synth.encodings import ENCODINGS
 from endotwin.synth.proof import CLAIMS, Written
 from endotwin.twin import Twin
@@ -35,14 +35,15 @@ def trajectory() -> Trajectory:
 
 @cache
 def twin() -> Twin:
-    """A tube with folds that hide each other, and a polyp."""
+    """A tube with folds that hide each other, a polyp and a film of blood."""
     tube = tube_twin.fitted(tube_twin.seen(tube_twin.surface(fold_mm=3.0)))
-    return with_polyps(tube, "Is:size=4", 0, trajectory())[0]
+    grown = with_polyps(tube, "Is:size=4", 0, trajectory())[0]
+    return with_fluids(grown, "blood:size=14,thickness=0.05", 0, trajectory())[0]
 
 
 def rendered(folder: Path, **options) -> Path:
     """A dataset of it."""
-    options = {"labels": parse_labels("all", polyps=True), "camera": CAMERA} | options
+    options = {"labels": parse_labels("all", polyps=True, fluids=True), "camera": CAMERA} | options
     synthesize(twin(), trajectory(), folder, **options)
     return folder
 
@@ -60,7 +61,7 @@ def test_every_claim_holds_of_every_layout(layout, tmp_path):
     assert all(row.pixels > 100 for row in proof.rows)
 
 
-@pytest.mark.parametrize("label", parse_labels("all", polyps=True))
+@pytest.mark.parametrize("label", parse_labels("all", polyps=True, fluids=True))
 def test_a_label_alone_proves_what_it_can_and_breaks_nothing(label, tmp_path):
     proof = prove(rendered(tmp_path / "d", labels=(label,), camera=tube_twin.CAMERA))
     assert proof.holds, proof.broken
@@ -106,6 +107,7 @@ WRONG = {
     "linear is not": ("rgb_linear", np.sqrt, "codes"),
     "a polyp has another number": ("polyp", lambda ids: 2 * ids, "polyps"),
     "polyps are a pixel lower": ("polyp", lambda ids: np.roll(ids, 1, axis=0), "polyps"),
+    "a fluid has another number": ("fluid", lambda ids: 2 * ids, "fluids"),
     "highlights are everywhere": ("highlights", lambda mask: np.full_like(mask, 255), "places"),
 }
 

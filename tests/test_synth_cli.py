@@ -17,6 +17,7 @@ from endotwin.anatomy import CLASSES
 from endotwin.sequence.poses import write_c3vd_poses
 from endotwin.sequence.readers import open_sequence
 from endotwin.synth import DEFAULT_LABELS, LABELS, LAYOUTS
+from endotwin.synth.fluids import FLUIDS
 from endotwin.synth.motion.kinds import KINDS
 
 FRAMES = 40
@@ -79,6 +80,18 @@ def test_polyps_bring_their_label_and_their_table(synth, tmp_path):
     assert len(list((tmp_path / "d" / "polyp").iterdir())) == FRAMES
 
 
+def test_fluids_bring_their_label_and_their_table(synth, tmp_path):
+    fluids = ("--fluid", "blood:size=6,count=2", "--fluid", "mucus:size=6")
+    code, _, err = synth(*fluids, "--layout", "flat", "-o", tmp_path / "d")
+    assert code == 0, err
+    document = json.loads((tmp_path / "d" / "dataset.json").read_text())
+    assert document["labels"] == [*DEFAULT_LABELS, "fluid"]
+    assert [(each["number"], each["kind"]) for each in document["fluids"]] == [
+        *((1, "blood"), (2, "blood"), (3, "mucus"))
+    ]
+    assert len(list((tmp_path / "d" / "fluid").iterdir())) == FRAMES
+
+
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_a_stopped_run_says_that_the_same_command_goes_on_and_it_does(
     synth, tmp_path, monkeypatch, number, code
@@ -125,6 +138,9 @@ def test_progress_shows_frames_a_second():
         (["-o", "{new}", "--polyp", "Is:size=25"], "choose a smaller size"),
         (["-o", "{new}", "--polyp", "Is:x=0,y=0,z=900"], "from the surface"),
         (["-o", "{new}", "--labels", "polyp"], "--polyp"),
+        (["-o", "{new}", "--fluid", "paint"], "blood or mucus or stool"),
+        (["-o", "{new}", "--fluid", "stool:pool=1"], "true or false"),
+        (["-o", "{new}", "--labels", "fluid"], "--fluid"),
         (["--preview", "{new}.jpg"], "png"),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",
@@ -144,5 +160,6 @@ def test_the_help_names_all_labels_and_layouts():
     assert all(kind in str(options["motion"]) for kind in KINDS)
     assert all(layout in str(options["layout"]) for layout in LAYOUTS)
     assert all(kind in str(options["polyp"]) for kind in CLASSES)
+    assert all(kind in str(options["fluid"]) for kind in FLUIDS)
     assert command.synth.__kwdefaults__ is None
     assert ",".join(DEFAULT_LABELS) in str(options["labels"])

@@ -8,11 +8,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy.sparse
 
-from endotwin.anatomy.refine import halved
+from endotwin.anatomy.carried import carried_film, coverage, kept
+from endotwin.anatomy.refine import Refined
 from endotwin.anatomy.shape import Shape, diameter
 from endotwin.anatomy.site import Site
 from endotwin.errors import OptionError
-from endotwin.light.film import Film
 from endotwin.surface import Surface
 from endotwin.surface.vectors import unit
 from endotwin.twin import Materials, Twin
@@ -76,7 +76,7 @@ def _with_one(
     """The twin with one more polyp; the polyps' numbers [F]; the weights of its vertices; the polyp."""
     surface, shape, site = twin.surface, seedling.shape, seedling.site
     patch = _Patch(site, shape)
-    fine = _Refined.of(surface, patch)
+    fine, around = _refined(surface, patch)
     rest, triangles, weights = fine.rest, fine.triangles, fine.weights
     inside = patch.inside(rest)
     moves = fine.vertices[inside]
@@ -89,74 +89,42 @@ def _with_one(
     normals = unit(weights @ surface.normals.astype(np.float64))
     placed, turned = patch.grown(rest[inside], normals[moves] @ site.axes.T)
     vertices_mm = weights @ surface.vertices_mm.astype(np.float64)
-    vertices_mm[moves] = site.placed(placed)
+    if not shape.flat:
+        vertices_mm[moves] = site.placed(placed)
+    changed = moves[:0] if shape.flat else moves
     turn = turned @ site.axes - normals[moves]
     normals[moves] += turn
     grown_surface = Surface(
         surface.origin_mm,
-        _kept(surface.vertices_mm, vertices_mm, moves),
+        kept(surface.vertices_mm, vertices_mm, changed),
         fine.replaced(surface.triangles, fine.vertices[triangles]).astype(np.int32),
-        _kept(surface.normals, normals, moves),
-        *_coverage(surface, weights),
+        kept(surface.normals, normals, changed),
+        *coverage(surface, weights),
     )
     colors = _Colors(shape, seedling.ihb / IHB / twin.response.gamma, moves, t[inside], placed)
-    materials = _materials(twin.materials, weights, colors, fine.around)
+    materials = _materials(twin.materials, weights, colors, around)
     if materials.film is not None:
-        materials = replace(materials, film=_film(materials.film, weights, moves, turn))
-    before = np.zeros(len(triangles), np.uint8)
-    before[fine.whole] = numbers[fine.rows]
-    numbers = fine.replaced(numbers, np.where(own, np.uint8(number), before))
+        materials = replace(materials, film=carried_film(materials.film, weights, moves, turn))
+    numbers = fine.replaced(numbers, np.where(own, np.uint8(number), numbers[fine.origin]))
     rest[inside] = placed
     polyp = _measured(shape, site, rest, triangles[own], t, surface.origin_mm)
     return replace(twin, surface=grown_surface, materials=materials), numbers, weights, polyp
 
 
-@dataclass(frozen=True, eq=False)
-class _Refined:
-    """The triangles about a site, cut as finely as the polyp that they become needs it.
-
-    Attributes:
-        rest: float64 [P, 3], points in the site's frame, not yet moved. vertices: int [P], of the surface,
-            the new ones last. triangles: [G, 3], of the points.
-        whole: bool [G], those that are not cut; rows: which of the surface's they are. gone: int, rows of
-            the surface's triangles that are cut. weights: CSR [W, V], of the old vertices in the new ones.
-        around: int [N], vertices of the wall about the site.
-    """
-
-    rest: np.ndarray
-    vertices: np.ndarray
-    triangles: np.ndarray
-    whole: np.ndarray
-    rows: np.ndarray
-    gone: np.ndarray
-    weights: scipy.sparse.csr_array
-    around: np.ndarray
-
-    @classmethod
-    def of(cls, surface: Surface, patch: _Patch) -> _Refined:
-        site, shape, count = patch.site, patch.shape, len(surface.vertices_mm)
-        touched = np.zeros(count, bool)
-        touched[surface.triangles[site.near(surface, AROUND * shape.radius_mm)]] = True
-        near = np.flatnonzero(touched[surface.triangles].any(axis=1))
-        old, corners = np.unique(surface.triangles[near], return_inverse=True)
-        rest = site.within(surface.vertices_mm[old].astype(np.float64))
-        around = old[~patch.inside(rest) & (patch.t(rest) < AROUND) & site.along(rest)]
-        most_mm = float(np.clip(shape.size_mm / EDGES, FINEST_MM, COARSEST_MM))
-        least_mm = most_mm / shape.magnified / 4
-        rest, triangles, which, local = halved(rest, corners.reshape(-1, 3), patch.moved, most_mm, least_mm)
-        whole = which >= 0
-        vertices = np.concatenate([old, np.arange(count, count + len(rest) - len(old))])
-        chosen = (np.ones(len(old)), old, np.arange(len(old) + 1))
-        between = local[len(old) :] @ scipy.sparse.csr_array(chosen, shape=(len(old), count))
-        weights = scipy.sparse.vstack([scipy.sparse.eye_array(count), between], "csr")
-        gone = np.delete(near, which[whole])
-        return cls(rest, vertices, triangles, whole, near[which[whole]], gone, weights, around)
-
-    def replaced(self, before: np.ndarray, values: np.ndarray) -> np.ndarray:
-        """What the surface's triangles have, ``before`` [F, ...], with the ``values`` [G, ...] of these."""
-        after = before.copy()
-        after[self.rows] = values[self.whole]
-        return np.concatenate([np.delete(after, self.gone, axis=0), values[~self.whole]])
+def _refined(surface: Surface, patch: _Patch) -> tuple[Refined, np.ndarray]:
+    """The triangles about a site, in its frame, as finely cut as the polyp that they become needs it; and
+    vertices [N] of the wall about it."""
+    site, shape, count = patch.site, patch.shape, len(surface.vertices_mm)
+    touched = np.zeros(count, bool)
+    touched[surface.triangles[site.near(surface, AROUND * shape.radius_mm)]] = True
+    near = np.flatnonzero(touched[surface.triangles].any(axis=1))
+    most_mm = float(np.clip(shape.size_mm / EDGES, FINEST_MM, COARSEST_MM))
+    least_mm = most_mm / shape.magnified / 4
+    fine = Refined.cut(surface, near, site.within, patch.moved, most_mm, least_mm)
+    old = fine.vertices < count
+    rest = fine.rest[old]
+    around = ~patch.inside(rest) & (patch.t(rest) < AROUND) & site.along(rest)
+    return fine, fine.vertices[old][around]
 
 
 class _Patch:
@@ -166,8 +134,8 @@ class _Patch:
         self.site, self.shape = site, shape
 
     def t(self, rest: np.ndarray) -> np.ndarray:
-        """Distance of points [N, 3] from the axis, as a share of the disc's radius."""
-        return np.linalg.norm(rest[:, :2], axis=1) / self.shape.radius_mm
+        """``Shape.t`` of points [N, 3]."""
+        return self.shape.t(rest[:, :2])
 
     def inside(self, rest: np.ndarray) -> np.ndarray:
         """Bool [N]: points that the polyp is made of."""
@@ -181,6 +149,8 @@ class _Patch:
 
     def grown(self, rest: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Where points [N, 3] with ``normals`` [N, 3] go, and their normals there."""
+        if self.shape.flat:
+            return rest, normals
         step = STEP * (np.linalg.norm(rest[:, :2], axis=1) + self.shape.radius_mm / self.shape.magnified)
         sides = []
         for axis in np.eye(2):
@@ -195,6 +165,8 @@ class _Patch:
         return self._grown(rest), unit(facing + self._rough(rest)[:, None] * (normals - level))
 
     def _grown(self, rest: np.ndarray) -> np.ndarray:
+        if self.shape.flat:
+            return rest
         moved = self.site.grown(self.shape, rest[:, :2])
         moved[:, 2] += self._rough(rest) * (rest[:, 2] - self.site.height_mm(rest[:, :2]))
         return moved
@@ -225,27 +197,6 @@ class _Colors:
         return even * (np.array([1, redder, redder]) * mottled) ** own
 
 
-def _kept(before: np.ndarray, after: np.ndarray, changed: np.ndarray) -> np.ndarray:
-    """``after`` as float32, the rows of ``before`` bit for bit where they are not ``changed``."""
-    result = after.astype(before.dtype)
-    same = np.ones(len(before), bool)
-    same[changed[changed < len(before)]] = False
-    result[: len(before)][same] = before[same]
-    return result
-
-
-def _coverage(surface: Surface, weights: scipy.sparse.csr_array) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """``seen_by``, ``nearest_mm`` and ``filled`` of vertices that lie between others: the worst of theirs."""
-    count = len(surface.vertices_mm)
-    rows, added = weights[count:], [surface.seen_by, surface.nearest_mm, surface.filled]
-    if not rows.shape[0]:
-        return tuple(added)
-    starts, parents = rows.indptr[:-1], rows.indices
-    for k, worst in enumerate((np.minimum, np.maximum, np.logical_or)):
-        added[k] = np.concatenate([added[k], worst.reduceat(added[k][parents], starts)])
-    return tuple(added)
-
-
 def _materials(
     materials: Materials, weights: scipy.sparse.csr_array, colors: _Colors, around: np.ndarray
 ) -> Materials:
@@ -258,22 +209,8 @@ def _materials(
             changed = colors.vertices
             wall = after[around] if len(around) else after[changed]
             after[changed] = colors.of(after[changed], wall)
-        arrays[name] = _kept(values, np.clip(after, 0, 1), changed)
+        arrays[name] = kept(values, np.clip(after, 0, 1), changed)
     return replace(materials, **arrays)
-
-
-def _film(film: Film, weights: scipy.sparse.csr_array, moved: np.ndarray, turn: np.ndarray) -> Film:
-    """The film on the new vertices too; its normals turn with those of the tissue, by ``turn`` [N, 3]."""
-    count = weights.shape[1]
-    weight = weights @ film.on_all(film.weight, count).astype(np.float64)
-    normal = weights @ film.on_all(film.normal, count).astype(np.float64)
-    normal[moved] += turn
-    vertex = np.flatnonzero(weight > 0)
-    return Film(
-        vertex.astype(np.int32),
-        unit(normal[vertex]).astype(np.float32),
-        weight[vertex].astype(np.float32),
-    )
 
 
 def _measured(
@@ -286,7 +223,7 @@ def _measured(
     return Polyp(
         kind=shape.kind,
         size_mm=round(diameter(placed[head, :2]), 3),
-        height_mm=round(float(above.max()), 3),
+        height_mm=0.0 if shape.flat else round(float(above[np.abs(above).argmax()]), 3),
         place_mm=tuple(round(float(x), 3) for x in site.foot_mm + origin_mm),
         axis=tuple(round(float(x), 5) for x in site.axes[2]),
         triangles=(0, 0),

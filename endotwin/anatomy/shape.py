@@ -101,8 +101,9 @@ class Shape:
 
     Attributes:
         kind: its class. size_mm: greatest diameter across the axis, of the head if it has a stalk.
-        height_mm: above the wall. lobes, phases: float64 [L], of the outline from above. waves: [W, 3] wave
-            vectors, 1/mm, offsets: [W], of its bumps. lean_mm: [2], shift of the top.
+        height_mm: above the wall; 0: its points stay where they are. lobes, phases: float64 [L], of the
+            outline from above. waves: [W, 3] wave vectors, 1/mm, offsets: [W], of its bumps. lean_mm: [2],
+            shift of the top.
     """
 
     kind: str
@@ -153,6 +154,11 @@ class Shape:
         return self._outline.head
 
     @property
+    def flat(self) -> bool:
+        """Whether it has a colour only."""
+        return self.height_mm == 0
+
+    @property
     def magnified(self) -> float:
         """How many times longer an edge becomes at the top."""
         return self._outline.r[0] / (np.exp(self._outline.log_t[0]) * self.radius_mm)
@@ -171,6 +177,12 @@ class Shape:
         """How much of the polyp's own there is at t [N]: 1 up to its edge, 0 on the wall."""
         return 1 - smoothstep((t - self.edge) / (1 - self.edge))
 
+    def t(self, across_mm: np.ndarray) -> np.ndarray:
+        """Distance of the disc's points [N, 2] from the axis as a share of its radius, [N]; of the radius in
+        the direction of each, where the polyp is flat: its outline has lobes though no point moves."""
+        t = np.linalg.norm(across_mm, axis=1) / self.radius_mm
+        return t / (self._wider * (1 + self._swing(across_mm))) if self.flat else t
+
     def at(self, across_mm: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Where the disc's points [N, 2] go: [N, 3] about the axis, mm, the wall being flat; and the wall's
         share [N] that its curvature has there."""
@@ -185,7 +197,20 @@ class Shape:
         """Factors [3] on the distance from the axis and on the height that make them what they are to be."""
         points, _ = self._uneven(self.rings(120, 180, self.head))
         wider = self.size_mm / diameter(points[:, :2])
-        return np.array([wider, wider, self.height_mm / points[:, 2].max()])
+        return np.array([wider, wider, self.height_mm / points[np.abs(points[:, 2]).argmax(), 2]])
+
+    @cached_property
+    def _wider(self) -> float:
+        """Factor on the outline from above that makes it as wide as it is to be."""
+        around = 360
+        rim = self.rings(2, around, self.head)[-around:]
+        return self.size_mm / diameter(rim * (1 + self._swing(rim))[:, None])
+
+    def _swing(self, across_mm: np.ndarray) -> np.ndarray:
+        """By which share of its width the outline is wider, [N], in the direction of points [N, 2]."""
+        angle = np.arctan2(across_mm[:, 1], across_mm[:, 0])
+        around = np.arange(2, 2 + len(self.lobes))
+        return (self.lobes * np.cos(around * angle[:, None] - self.phases)).sum(axis=1)
 
     def _uneven(self, across_mm: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """What ``at`` gives, before its width is set and it leans."""
@@ -193,9 +218,7 @@ class Shape:
         t = np.minimum(rho / self.radius_mm, 1)
         (r, z), (dr, dz) = self._outline.at(t)
         towards = across_mm / rho[:, None]
-        angle = np.arctan2(across_mm[:, 1], across_mm[:, 0])
-        around = np.arange(2, 2 + len(self.lobes))
-        swing = (self.lobes * np.cos(around * angle[:, None] - self.phases)).sum(axis=1)
+        swing = self._swing(across_mm)
         own = self.own(t)
         points = np.c_[(r * (1 + own * swing))[:, None] * towards, z]
         facing = np.c_[-dz[:, None] * towards, dr] / np.maximum(np.hypot(dr, dz), 1e-9)[:, None]
@@ -211,4 +234,4 @@ class Shape:
         """Height of bumps [N] at points [N, 3]."""
         length_mm = 2 * np.pi / np.sqrt(dot(self.waves, self.waves))
         swings = np.cos(points_mm @ self.waves.T + self.offsets)
-        return BUMPS / np.sqrt(len(length_mm)) * swings @ length_mm
+        return self.paris.bumps * BUMPS / np.sqrt(len(length_mm)) * swings @ length_mm

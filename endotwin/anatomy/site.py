@@ -130,12 +130,14 @@ class Site:
         if self.single < WHOLE:
             return "the wall there lies in layers"
         if not self._has_room(shape, caster):
-            return "the lumen is too narrow there"
+            return "the lumen is too narrow there" if shape.height_mm > 0 else "the wall there is too thin"
         torn = self._torn(shape, caster.surface)  # which takes the longest
         return "the wall there is not whole, or too bent" if torn else ""
 
     def _has_room(self, shape: Shape, caster: Caster) -> bool:
         """Whether nothing is in the way of a shape that grows here."""
+        if shape.height_mm <= 0:
+            return shape.flat or self._is_deep(shape, caster)
         points = self.grown(shape, shape.rings(16, 12, shape.edge))
         top = points[points[:, 2].argmax()]
         risen = points[points[:, 2] > max(0.3 * shape.height_mm, self.band_mm)]
@@ -147,6 +149,17 @@ class Site:
         far = length_mm > 1e-6
         starts = self.placed(starts)[far].astype(np.float32)
         return caster.unobstructed(starts, unit(way[far]).astype(np.float32), length_mm[far]).all()
+
+    def _is_deep(self, shape: Shape, caster: Caster) -> bool:
+        """Whether a shape below the wall ends above what lies behind the wall."""
+        across = shape.rings(16, 24, shape.edge)
+        sunk = self.grown(shape, across)
+        above = np.c_[sunk[:, :2], self.height_mm(sunk[:, :2]) + self.band_mm]
+        *_, wall_mm = _cast(caster, self.placed(above), -self.axes[2])
+        met = np.isfinite(wall_mm)
+        above = above[met] - np.c_[np.zeros((met.sum(), 2)), wall_mm[met] + 0.01]
+        *_, behind_mm = _cast(caster, self.placed(above), -self.axes[2])
+        return bool((above[:, 2] - behind_mm < sunk[met, 2] + (ROOM - 1) * shape.height_mm).all())
 
 
 def _powers(across: np.ndarray) -> np.ndarray:

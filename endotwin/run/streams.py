@@ -15,6 +15,7 @@ class Stream(IntEnum):
     VARIATION = 3
     SENSOR = 4
     POLYP = 5
+    FLUID = 6
 
     def generator(self, seed: int, index: int = 0) -> np.random.Generator:
         """The numbers of one frame (or clip) ``index``, the same whatever else is drawn.

@@ -1,5 +1,6 @@
 """Rendered datasets: trajectories through a twin, variation of it, and labelled frames."""
 
+from endotwin.synth.fluids import with_fluids
 from endotwin.synth.job import Job
 from endotwin.synth.labels import DEFAULT_LABELS, LABELS, parse_labels
 from endotwin.synth.layouts import LAYOUTS
@@ -39,5 +40,6 @@ __all__ = [
     "read_variation",
     "render_dataset",
     "synthesize",
+    "with_fluids",
     "with_polyps",
 ]

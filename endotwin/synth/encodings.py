@@ -274,6 +274,13 @@ ENCODINGS: dict[str, Encoding] = {
         "8-bit: number of the polyp that is seen, counted from 1 (see polyps in dataset.json); 0: none",
         pixels,
     ),
+    "fluid": Encoding(
+        ".png",
+        png,
+        "8-bit: number of the patch of fluid that is seen, counted from 1 (see fluids in dataset.json for "
+        "its kind); 0: bare tissue",
+        pixels,
+    ),
     "overlay": Encoding(
         ".png",
         png,

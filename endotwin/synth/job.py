@@ -82,10 +82,12 @@ class Job:
 
 
 def fingerprint(twin: Twin) -> str:
-    """SHA-256 of all that frames depend on: surface, materials, camera, light, response, effects, polyps."""
+    """SHA-256 of all that frames depend on: surface, materials, camera, light, response, effects, polyps,
+    fluids."""
     digest = hashlib.sha256(json.dumps(twin.effects.to_dict(), sort_keys=True).encode())
     parts = (twin.surface, twin.camera, twin.light, twin.response)
     digest.update(json.dumps([asdict(polyp) for polyp in twin.polyps]).encode() if twin.polyps else b"")
+    digest.update(json.dumps([asdict(fluid) for fluid in twin.fluids]).encode() if twin.fluids else b"")
     values = [(field.name, getattr(part, field.name)) for part in parts for field in fields(part)]
     materials = twin.materials.arrays | twin.materials.constants
     for name, value in (*values, *materials.items()):

@@ -18,6 +18,7 @@ from endotwin.surface.vectors import shifted
 from endotwin.synth.job import Job
 from endotwin.synth.photograph import photographed
 from endotwin.synth.sight import Sights
+from endotwin.twin.fluids import covered
 from endotwin.twin.polyps import numbered
 
 MASK_NONE, MASK_FILLED, MASK_UNSEEN, MASK_VALID = 0, 64, 128, 255
@@ -45,6 +46,7 @@ LABELS: dict[str, tuple[str, ...]] = {
     "occlusion": ("occlusion",),
     "triangles": ("triangles",),
     "polyp": ("polyp",),
+    "fluid": ("fluid",),
     "overlay": ("overlay",),
     "scene_flow": ("scene_flow",),
     "scene_flow_forward": ("scene_flow_forward",),
@@ -57,6 +59,9 @@ OF_MOTION = ("scene_flow", "scene_flow_forward", "vertices")
 
 OF_POLYPS = ("polyp",)
 """Labels that only a twin with polyps has."""
+
+OF_FLUIDS = ("fluid",)
+"""Labels that only a twin with fluids has."""
 
 DEFAULT_LABELS = ("rgb", "depth", "normals", "mask")
 
@@ -75,14 +80,18 @@ SHADED = PHOTOS | SPLIT | {"albedo", "roughness", "metallic", "overlay"}
 """Labels that need a photo, those of its parts, and all that need the frame's draw."""
 
 
-def parse_labels(text: str, moving: bool = False, polyps: bool = False) -> tuple[str, ...]:
+def parse_labels(
+    text: str, moving: bool = False, polyps: bool = False, fluids: bool = False
+) -> tuple[str, ...]:
     """Names of labels from ``rgb,depth,…`` or ``all``, in their own order; raises OptionError.
 
-    ``all`` is those of tissue that is ``moving`` by itself, or is not, and has ``polyps``, or has none.
+    ``all`` is those of tissue that is ``moving`` by itself, or is not, and has ``polyps`` and ``fluids``, or
+    has none.
     """
     names = [name.strip() for name in text.split(",") if name.strip()]
     if names == ["all"]:
-        missing = {*(() if moving else OF_MOTION), *(() if polyps else OF_POLYPS)}
+        parts = ((moving, OF_MOTION), (polyps, OF_POLYPS), (fluids, OF_FLUIDS))
+        missing = {name for there, names in parts if not there for name in names}
         return tuple(name for name in LABELS if name not in missing)
     unknown = [name for name in names if name not in LABELS]
     if unknown or not names:
@@ -108,7 +117,11 @@ class Labeller:
         self._job = job
         self._sights = Sights(job.twin.surface, job.motion, job.trajectory, job.camera)
         self._kinds = triangle_kinds(job.twin.surface)
-        self._polyps = numbered((each.triangles for each in job.twin.polyps), len(job.twin.surface.triangles))
+        twin, count = job.twin, len(job.twin.surface.triangles)
+        self._things = {
+            "polyp": numbered((each.triangles for each in twin.polyps), count),
+            "fluid": covered((each.triangles for each in twin.fluids), count),
+        }
         self._T_world_next = following(job.trajectory.T_world_camera)
         self._shaded: tuple[object, Renderer, Renderer | None] | None = None
 
@@ -137,7 +150,7 @@ class Labeller:
                 red, green, blue = np.moveaxis(images["specular"] > HIGHLIGHT, 2, 0)
                 images["highlights"] = np.uint8(255) * (red & green & blue)
             view = view or matt
-        geometry = _Geometry(job, self._sights, index, self._kinds, self._polyps, renderer, view)
+        geometry = _Geometry(job, self._sights, index, self._kinds, self._things, renderer, view)
         for name in job.images:
             if name not in images:
                 images[name] = getattr(geometry, name)
@@ -177,7 +190,7 @@ class _Geometry:
         sights: Sights,
         index: int,
         kinds: np.ndarray,
-        polyps: np.ndarray,
+        things: dict[str, np.ndarray],
         renderer: Renderer | None,
         view: View | None,
     ):
@@ -186,7 +199,7 @@ class _Geometry:
         self._hits = self._sight.hits
         self._ways: dict[int, np.ndarray] = {}
         self._places: dict[int, np.ndarray] = {}
-        self._kinds, self._polyps, self._renderer, self._view = kinds, polyps, renderer, view
+        self._kinds, self._things, self._renderer, self._view = kinds, things, renderer, view
 
     def _image(self, values: np.ndarray, empty: float = 0.0) -> np.ndarray:
         shape = (self._job.camera.height, self._job.camera.width)
@@ -238,7 +251,11 @@ class _Geometry:
 
     @property
     def polyp(self) -> np.ndarray:
-        return self._image(self._polyps[self._hits.triangle])
+        return self._image(self._things["polyp"][self._hits.triangle])
+
+    @property
+    def fluid(self) -> np.ndarray:
+        return self._image(self._things["fluid"][self._hits.triangle])
 
     @property
     def overlay(self) -> np.ndarray:

@@ -2,43 +2,31 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass, field
+from itertools import islice
 
 import numpy as np
 import scipy.sparse
-from scipy.spatial import cKDTree
 
 from endotwin.anatomy import CLASSES, Seedling, Site, grown
 from endotwin.anatomy.shape import Shape
 from endotwin.cameras import Camera
 from endotwin.errors import OptionError, TwinError
 from endotwin.run.streams import Stream
-from endotwin.surface import Surface
 from endotwin.surface.casting import Caster
-from endotwin.surface.vectors import dot, unit
+from endotwin.surface.vectors import dot
 from endotwin.synth.trajectories import Trajectory
 from endotwin.synth.trajectories.trajectory import parse_options
-from endotwin.synth.trajectories.wall_point import WallPoint, wall_point
+from endotwin.synth.trajectories.wall_point import WallPoint
+from endotwin.synth.wall import Wall
 from endotwin.twin import Twin
 from endotwin.twin.polyps import MOST_POLYPS
 
 SMALLEST_MM, LARGEST_MM = 1.0, 50.0
 
-VIEWS, GRID = 48, 40
-"""Poses of a trajectory whose view is searched for places, and pixels of a view across and down."""
-
-FACING = 0.35
-"""Least cosine between the wall's normal and the ray to it, of a place drawn by chance."""
-
-FARTHEST_MM = 60.0
-"""Of a place drawn by chance, from a pose that sees it."""
-
 TRIES = 400
 """Places that are tried for one polyp."""
-
-OFF_MM = 2.0
-"""A point that is given lies on the wall if it is no farther from it."""
 
 
 @dataclass(frozen=True)
@@ -46,16 +34,13 @@ class PolypOptions(WallPoint):
     """Options of a polyp of any class."""
 
     size: float = field(default=6.0, metadata={"help": "greatest diameter, of the head of a stalk, mm"})
-    height: float = field(default=0.0, metadata={"help": "above the wall, mm; 0: the class's usual one"})
+    height: float = field(
+        default=0.0, metadata={"help": "above the wall, mm; 0: the class's usual one", "signed": True}
+    )
     count: int = field(default=1, metadata={"help": "number of such polyps"})
     ihb: float = field(
         default=2.9, metadata={"help": "index of haemoglobin above that of the wall", "signed": True}
     )
-
-    @property
-    def placed(self) -> bool:
-        """Whether any part of a place is given."""
-        return not np.isnan([self.x, self.y, self.z, self.u, self.v]).all()
 
 
 def with_polyps(
@@ -77,6 +62,8 @@ def with_polyps(
     """
     if not twin.fitted:
         raise TwinError("the twin has no materials yet; run 'endotwin fit' on it first")
+    if twin.fluids:
+        raise OptionError("fluids lie on this twin already; grow polyps on the one without them")
     asked = [(spec, *parse_polyp(spec)) for spec in ([specs] if isinstance(specs, str) else specs)]
     if len(twin.polyps) + sum(options.count for *_, options in asked) > MOST_POLYPS:
         raise OptionError(f"a twin holds {MOST_POLYPS} polyps at most; ask for fewer")
@@ -112,13 +99,13 @@ class _Garden:
     """The wall of one twin, and the places on it that are taken."""
 
     def __init__(self, twin: Twin, trajectory: Trajectory | None, camera: Camera):
-        self._twin, self._trajectory, self._camera = twin, trajectory, camera
+        self._twin, self._trajectory = twin, trajectory
         self._caster = Caster(twin.surface)
         self._taken = [
             (np.array(polyp.place_mm) - twin.surface.origin_mm, CLASSES[polyp.kind].radius_mm(polyp.size_mm))
             for polyp in twin.polyps
         ]
-        self._views: tuple[np.ndarray, np.ndarray] | None = None
+        self._wall = Wall(twin, trajectory, camera, self._caster)
 
     def seedling(
         self, spec: str, kind: str, options: PolypOptions, generator: np.random.Generator
@@ -127,7 +114,8 @@ class _Garden:
         height_mm = options.height or CLASSES[kind].usual_height_mm(options.size)
         shape = Shape.drawn(kind, options.size, height_mm, generator)
         fault = "no wall is seen"
-        for point, normal in self._places(spec, options, generator):
+        places = self._wall.places(f"polyp {spec!r}", options, generator)
+        for point, normal in islice(places, TRIES):
             site = Site.at(point, normal, shape.radius_mm, self._caster)
             fault = self._fault(shape, site, options.placed)
             if not fault:
@@ -139,38 +127,6 @@ class _Garden:
             f"polyp {spec!r}: of the wall that is seen, no place that was tried holds it (at the last one, "
             f"{fault}); choose a smaller size or count, or a place"
         )
-
-    def _places(
-        self, spec: str, options: PolypOptions, generator: np.random.Generator
-    ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-        """Points [3] of the wall, in the surface's frame, and its normals [3]."""
-        surface = self._twin.surface
-        if options.placed:
-            point = wall_point(options, self._twin, f"polyp {spec!r}", OptionError) - surface.origin_mm
-            off_mm, nearest = cKDTree(surface.vertices_mm).query(point)
-            if off_mm > OFF_MM:
-                raise OptionError(
-                    f"polyp {spec!r}: its place is {off_mm:.1f} mm from the surface; give a point of the wall"
-                )
-            yield surface.vertices_mm[nearest].astype(np.float64), surface.normals[nearest]
-            return
-        points, normals = self._seen()
-        for k in generator.permutation(len(points))[:TRIES]:
-            yield points[k], normals[k]
-
-    def _seen(self) -> tuple[np.ndarray, np.ndarray]:
-        """Points [N, 3] of the wall that may be chosen, and normals [N, 3]."""
-        if self._views is None:
-            surface = self._twin.surface
-            if self._trajectory is None:
-                seen = np.flatnonzero((surface.seen_by > 0) & ~surface.filled)
-                self._views = surface.vertices_mm[seen].astype(np.float64), surface.normals[seen]
-            else:
-                chosen = np.linspace(0, len(self._trajectory) - 1, VIEWS).round().astype(int)
-                poses = self._trajectory.T_world_camera[np.unique(chosen)]
-                views = [_seen_from(pose, surface, self._camera, self._caster) for pose in poses]
-                self._views = tuple(np.concatenate(each) for each in zip(*views, strict=True))
-        return self._views
 
     def _fault(self, shape: Shape, site: Site, placed: bool) -> str:
         """What hinders the shape from growing at the site, as the end of a sentence."""
@@ -184,23 +140,6 @@ class _Garden:
         clear_mm = shape.size_mm / 2 + (limits.clearance_mm if limits else 0.0)
         cameras = self._trajectory.T_world_camera[:, :3, 3] - self._twin.surface.origin_mm
         local = site.within(cameras)
-        local[:, 2] -= np.clip(local[:, 2], 0, shape.height_mm)
+        local[:, 2] -= np.clip(local[:, 2], 0, max(shape.height_mm, 0))
         near = dot(local, local) < clear_mm**2
         return "a pose of the trajectory is too near to it" if near.any() else ""
-
-
-def _seen_from(
-    T_world_camera: np.ndarray, surface: Surface, camera: Camera, caster: Caster
-) -> tuple[np.ndarray, np.ndarray]:
-    """Points [N, 3] of well seen wall in one view, and normals [N, 3]."""
-    mask = np.zeros((camera.height, camera.width), bool)
-    down, across = (np.linspace(0, size - 1, GRID).astype(int) for size in mask.shape)
-    mask[np.ix_(down, across)] = True
-    hits = caster.cast(camera, T_world_camera, mask)
-    corners = surface.triangles[hits.triangle]
-    measured = (surface.seen_by[corners] > 0).all(axis=1) & ~surface.filled[corners].any(axis=1)
-    points = hits.interpolate(surface, surface.vertices_mm.astype(np.float64))
-    normals = unit(hits.interpolate(surface, surface.normals))
-    rays = unit(points - surface.to_local(T_world_camera)[:3, 3])
-    chosen = measured & (dot(rays, normals) < -FACING) & (hits.distance_mm < FARTHEST_MM)
-    return points[chosen], normals[chosen]

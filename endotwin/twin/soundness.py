@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from endotwin.twin.fluids import MOST_FLUIDS
 from endotwin.twin.polyps import MOST_POLYPS
 
 if TYPE_CHECKING:
@@ -55,6 +56,10 @@ def require_sound(twin: Twin) -> Twin:
     _require("the fit", all(fitted) or not any(fitted))
     ends = [0, *(end for polyp in twin.polyps for end in np.cumsum(polyp.triangles)), len(triangles)]
     _require("the place of a polyp", ends == sorted(ends) and len(twin.polyps) <= MOST_POLYPS)
+    for fluid in twin.fluids:
+        ends = [0, *(end for run in fluid.triangles for end in np.cumsum(run)), len(triangles)]
+        _require("the place of a fluid", ends == sorted(ends))
+    _require("the number of fluids", len(twin.fluids) <= MOST_FLUIDS)
     if all(fitted):
         _require_fit(twin, count)
     return twin

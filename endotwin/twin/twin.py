@@ -26,6 +26,7 @@ from endotwin.sequence import Sequence, Split
 from endotwin.sequence.readers import open_sequence
 from endotwin.surface import Surface
 from endotwin.twin import meshes
+from endotwin.twin.fluids import Fluid
 from endotwin.twin.polyps import Polyp
 from endotwin.twin.registration import Registration
 from endotwin.twin.soundness import require_sound
@@ -174,7 +175,7 @@ class Twin:
         record: how the twin was made: options, seconds of each stage, scores.
         effects: what it has beside the paper's light and materials. decisions: why, by name of the effect.
         registration: corrections of the photos' poses; None: they are where the sequence says.
-        polyps: that were grown on the surface.
+        polyps: that were grown on the surface. fluids: that lie on it.
     """
 
     surface: Surface
@@ -188,6 +189,7 @@ class Twin:
     decisions: dict[str, Decision] = field(default_factory=dict)
     registration: Registration | None = None
     polyps: tuple[Polyp, ...] = ()
+    fluids: tuple[Fluid, ...] = ()
 
     @property
     def fitted(self) -> bool:
@@ -214,6 +216,10 @@ class Twin:
         if self.polyps:
             lines.append(
                 f"polyps: {', '.join(f'{each.kind} of {each.size_mm:.1f} mm' for each in self.polyps)}"
+            )
+        if self.fluids:
+            lines.append(
+                f"fluids: {', '.join(f'{each.kind} over {each.size_mm:.1f} mm' for each in self.fluids)}"
             )
         scores = self.record.get("eval")
         if scores and scores.get("psnr") is not None:
@@ -330,6 +336,8 @@ class Twin:
             document["registration"] = self.registration.to_dict()
         if self.polyps:
             document["polyps"] = [asdict(polyp) for polyp in self.polyps]
+        if self.fluids:
+            document["fluids"] = [asdict(fluid) for fluid in self.fluids]
         return {**document, "seal": _seal(document)}
 
     @classmethod
@@ -359,6 +367,7 @@ class Twin:
                 if (moved := document.get("registration"))
                 else None,
                 polyps=tuple(map(Polyp.from_dict, document.get("polyps", ()))),
+                fluids=tuple(map(Fluid.from_dict, document.get("fluids", ()))),
             )
             return require_sound(twin)
         except FileNotFoundError as error:

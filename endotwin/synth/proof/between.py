@@ -34,8 +34,8 @@ def between(one: Frame, other: Frame) -> Iterator[Judged]:
         hidden = one.first(f"{name}_hidden")
         yield from _depths(other, there, None if hidden is None else hidden.ravel()[there.chosen])
         yield from _materials(one, other, there)
-        if written.has("polyp"):
-            yield "polyps", _polyps(one, other, there)
+        for label in filter(written.has, ("polyp", "fluid")):
+            yield f"{label}s", _numbers(label, one, other, there)
     if flow_px is not None and back_px is not None and other.distance_mm is not None:
         yield "cycle", _cycle(one, other, name, flow_px, back_px)
 
@@ -78,11 +78,11 @@ def _same_tissue(other: Frame, there: Landing) -> Sampled:
     return about.where(lies)
 
 
-def _polyps(one: Frame, other: Frame, there: Landing) -> np.ndarray:
-    """Whether the tissue of a polyp is of another there, or of none, where all about it is of one."""
+def _numbers(label: str, one: Frame, other: Frame, there: Landing) -> np.ndarray:
+    """Whether what has a number of the ``label`` has another there, or none, where all about it has one."""
     about = _same_tissue(other, there)
-    four = about.values(other.image("polyp"))
-    here = one.image("polyp").ravel()[there.chosen[about.chosen]]
+    four = about.values(other.image(label))
+    here = one.image(label).ravel()[there.chosen[about.chosen]]
     told = (four == four[:, :1]).all(axis=1) & ((four[:, 0] > 0) | (here > 0))
     return (four[:, 0] != here)[told].astype(float)
 

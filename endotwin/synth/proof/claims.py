@@ -41,6 +41,7 @@ CLAIMS = {
     "triangles": Claim("a pixel's point lies on the triangle that is named", "mm", 0.01, 1e-4, "rounding"),
     "materials": Claim("materials stay with the tissue", "of 1", 0.01, 0.02, "edges"),
     "polyps": Claim("a polyp's number stays with its tissue", "pixels", 0.0, 0.02, "rims"),
+    "fluids": Claim("a fluid's number stays with its place", "pixels", 0.0, 0.02, "rims"),
     "response": Claim("rgb is rgb_linear after the response", "of 255", 1.5, 1e-3, "rounding"),
     "split": Claim("rgb is diffuse and specular together", "of 255", 1.6, 1e-3, "rounding"),
 }

@@ -11,6 +11,7 @@ from endotwin.effects import RENDERED
 from endotwin.surface.vectors import dot, unit
 from endotwin.synth.photograph import RECORDING
 from endotwin.synth.proof.warp import DEPTHS, Frame
+from endotwin.twin.fluids import covered
 from endotwin.twin.polyps import numbered
 
 Judged = tuple[str, np.ndarray]
@@ -44,9 +45,11 @@ def within(frame: Frame) -> Iterator[Judged]:
     placed = not frame.written.moving or frame.written.has("vertices")
     if frame.written.has("triangles") and frame.distance_mm is not None and placed:
         yield "triangles", _triangles(frame)
-    if frame.written.has("triangles", "polyp"):
-        told, named = frame.image("polyp"), _named(frame)
-        yield "polyps", (told != named)[(told > 0) | (named > 0)].astype(float)
+    for name, numbers in (("polyp", _polyps), ("fluid", _fluids)):
+        if frame.written.has("triangles", name):
+            told, triangle = frame.image(name), frame.image("triangles")
+            named = np.where(triangle >= 0, numbers(frame)[triangle], 0)
+            yield f"{name}s", (told != named)[(told > 0) | (named > 0)].astype(float)
     yield from _colors(frame)
 
 
@@ -81,6 +84,7 @@ def _places(frame: Frame) -> Iterator[Judged]:
         ("roughness", np.bool_),
         ("occlusion", np.bool_),
         ("polyp", np.bool_),
+        ("fluid", np.bool_),
     ):
         if has(name):
             wrong |= told(frame.image(name)) & ~there
@@ -149,12 +153,16 @@ def _triangles(frame: Frame) -> np.ndarray:
     return np.maximum(off, 0)
 
 
-def _named(frame: Frame) -> np.ndarray:
-    """Numbers [H, W] of the polyps to which ``dataset.json`` counts the triangles that are named."""
+def _polyps(frame: Frame) -> np.ndarray:
+    """Numbers [F] of the polyps to which ``dataset.json`` counts the triangles."""
     polyps = frame.written.document["polyps"]
-    numbers = numbered((each["triangles"] for each in polyps), len(frame.written.surface[1]))
-    triangle = frame.image("triangles")
-    return np.where(triangle >= 0, numbers[triangle], 0)
+    return numbered((each["triangles"] for each in polyps), len(frame.written.surface[1]))
+
+
+def _fluids(frame: Frame) -> np.ndarray:
+    """Numbers [F] of the fluids to which ``dataset.json`` counts the triangles."""
+    fluids = frame.written.document["fluids"]
+    return covered((each["triangles"] for each in fluids), len(frame.written.surface[1]))
 
 
 def _colors(frame: Frame) -> Iterator[Judged]:

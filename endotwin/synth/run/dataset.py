@@ -148,6 +148,8 @@ def make_job(
         raise OptionError(f"the label {still[0]} needs tissue that moves; ask for motion too (--motion)")
     if "polyp" in labels and not twin.polyps:
         raise OptionError("the label polyp needs polyps; ask for some too (--polyp)")
+    if "fluid" in labels and not twin.fluids:
+        raise OptionError("the label fluid needs a fluid; ask for one too (--fluid)")
     refusal = LAYOUTS[layout].refusal(camera, labels)
     if refusal:
         raise OptionError(f"layout {layout}: {refusal}")

@@ -38,6 +38,7 @@ def write_datasheet(path: Path, document: dict, statistics: Statistics, proof: P
         _table("Variation", _flat(document["variation"])),
         _table("Motion", _flat(document.get("motion", {}))),
         _table("Polyps", dict(map(_polyp, document.get("polyps", ())))),
+        _table("Fluids", dict(map(_fluid, document.get("fluids", ())))),
         _table("Twin", _flat(document["twin"])),
         _table("Camera", document["camera"]),
         _table("Conventions", document["conventions"]),
@@ -59,6 +60,15 @@ def _polyp(polyp: dict) -> tuple[str, str]:
     return str(polyp["number"]), (
         f"{polyp['paris']}, {polyp['size_mm']:.1f} mm wide, {polyp['height_mm']:.1f} mm high, at "
         f"({x:.1f}, {y:.1f}, {z:.1f}) mm"
+    )
+
+
+def _fluid(fluid: dict) -> tuple[str, str]:
+    """Number and description of a patch of fluid."""
+    x, y, z = fluid["place_mm"]
+    return str(fluid["number"]), (
+        f"{fluid['kind']}{', a pool' if fluid['pool'] else ''}, {fluid['size_mm']:.1f} mm wide, up to "
+        f"{fluid['thickness_mm']:.2f} mm thick, at ({x:.1f}, {y:.1f}, {z:.1f}) mm"
     )
 
 

@@ -49,6 +49,8 @@ def describe(
     chosen = LAYOUTS[layout]
     moving = {} if motion is None else {"motion": motion.to_dict()}
     standing = {"polyps": _table(twin)} if twin.polyps else {}
+    if twin.fluids:
+        standing["fluids"] = [{"number": k, **asdict(fluid)} for k, fluid in enumerate(twin.fluids, 1)]
     words = {image: chosen.encoding(image).words for label in labels for image in LABELS[label]}
     return {
         "format": layout,

@@ -23,6 +23,11 @@ class WallPoint:
     u: float = field(default=nan, metadata={"help": "pixel, to the right"})
     v: float = field(default=nan, metadata={"help": "pixel, down"})
 
+    @property
+    def placed(self) -> bool:
+        """Whether any part of a place is given."""
+        return not np.isnan([self.x, self.y, self.z, self.u, self.v]).all()
+
 
 def wall_point(options: WallPoint, twin: Twin, what: str, error: type[EndotwinError]) -> np.ndarray:
     """The point of the options of ``what``, float64 [3], world mm.
