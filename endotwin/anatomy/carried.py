@@ -19,16 +19,18 @@ def kept(before: np.ndarray, after: np.ndarray, changed: np.ndarray) -> np.ndarr
     return result
 
 
-def coverage(surface: Surface, weights: scipy.sparse.csr_array) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def coverage(surface: Surface, weights: scipy.sparse.csr_array) -> dict[str, np.ndarray]:
     """``seen_by``, ``nearest_mm`` and ``filled`` of vertices that lie between others: the worst of theirs."""
-    count = len(surface.vertices_mm)
-    rows, added = weights[count:], [surface.seen_by, surface.nearest_mm, surface.filled]
+    rows = weights[len(surface.vertices_mm) :]
+    worst = {"seen_by": np.minimum, "nearest_mm": np.maximum, "filled": np.logical_or}
+    values = {name: getattr(surface, name) for name in worst}
     if not rows.shape[0]:
-        return tuple(added)
+        return values
     starts, parents = rows.indptr[:-1], rows.indices
-    for k, worst in enumerate((np.minimum, np.maximum, np.logical_or)):
-        added[k] = np.concatenate([added[k], worst.reduceat(added[k][parents], starts)])
-    return tuple(added)
+    return {
+        name: np.concatenate([old, worst[name].reduceat(old[parents], starts)])
+        for name, old in values.items()
+    }
 
 
 def carried_film(film: Film, weights: scipy.sparse.csr_array, moved: np.ndarray, turn: np.ndarray) -> Film:

@@ -94,12 +94,12 @@ def _with_one(
     changed = moves[:0] if shape.flat else moves
     turn = turned @ site.axes - normals[moves]
     normals[moves] += turn
-    grown_surface = Surface(
-        surface.origin_mm,
-        kept(surface.vertices_mm, vertices_mm, changed),
-        fine.replaced(surface.triangles, fine.vertices[triangles]).astype(np.int32),
-        kept(surface.normals, normals, changed),
-        *coverage(surface, weights),
+    grown_surface = replace(
+        surface,
+        vertices_mm=kept(surface.vertices_mm, vertices_mm, changed),
+        triangles=fine.replaced(surface.triangles, fine.vertices[triangles]).astype(np.int32),
+        normals=kept(surface.normals, normals, changed),
+        **coverage(surface, weights),
     )
     colors = _Colors(shape, seedling.ihb / IHB / twin.response.gamma, moves, t[inside], placed)
     materials = _materials(twin.materials, weights, colors, around)

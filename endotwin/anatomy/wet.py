@@ -143,12 +143,12 @@ class Wetted:
         vertices_mm[moves] = placed[wet]
         turned[fine.vertices] = after
         changed = np.union1d(moves, fine.vertices[np.unique(fine.triangles[on])])
-        laid = Surface(
-            surface.origin_mm,
-            kept(surface.vertices_mm, vertices_mm, moves),
-            fine.replaced(surface.triangles, fine.vertices[fine.triangles]).astype(np.int32),
-            kept(surface.normals, turned, changed),
-            *coverage(surface, weights),
+        laid = replace(
+            surface,
+            vertices_mm=kept(surface.vertices_mm, vertices_mm, moves),
+            triangles=fine.replaced(surface.triangles, fine.vertices[fine.triangles]).astype(np.int32),
+            normals=kept(surface.normals, turned, changed),
+            **coverage(surface, weights),
         )
         materials = _materials(twin.materials, weights, puddle.optics, moves, layer.thickness_mm[wet])
         if materials.film is not None:
