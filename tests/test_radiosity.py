@@ -8,7 +8,7 @@ import trimesh
 
 from endotwin.fusion.mesh import surface_of
 from endotwin.light.guides import COSINE
-from endotwin.light.radiosity import BOUNCES, Radiosity
+from endotwin.light.radiosity import BOUNCES, LEAST_AREA, Radiosity
 from endotwin.surface.casting import Caster
 
 RADIUS_MM = 10.0
@@ -61,6 +61,37 @@ def test_half_a_sphere_gets_nearly_the_bounce_of_the_whole_from_what_nobody_saw(
     without = half.indirect(direct, np.full((half.count, 3), albedo))
     assert np.mean(bounced) == pytest.approx(true, rel=0.2)
     assert abs(np.mean(bounced) - true) < abs(np.mean(without) - true) / 2
+
+
+@pytest.mark.parametrize("albedo", [0.3, 0.6])
+def test_half_a_sphere_whose_wall_is_the_other_half_gets_the_bounce_of_the_whole(hollow_sphere, albedo):
+    centre = hollow_sphere.vertices_mm[hollow_sphere.triangles].mean(axis=1)
+    seen, other = (hollow_sphere.triangles[side] for side in (centre[:, 2] > 0, centre[:, 2] <= 0))
+    walled = replace(hollow_sphere, triangles=seen, wall_mm=hollow_sphere.vertices_mm, wall_triangles=other)
+    half = Radiosity(walled, Caster(walled), cell_mm=3.0)
+    direct = half.direct([half.lamp(np.eye(4), np.zeros(3), COSINE)], n=2.0, q=2.0)
+    bounced = half.indirect(direct, np.full((half.count, 3), albedo))
+    true = albedo / (1 - albedo) * RADIUS_MM**-2.0 / 6
+    assert bounced.mean() == pytest.approx(true, rel=0.02)
+    assert bounced.std() < 0.1 * true
+    assert bounced.shape == (half.count, 1, 3)
+
+
+def test_nothing_of_the_wall_lies_in_the_way_of_light_to_the_surface(hollow_sphere):
+    inner = replace(
+        hollow_sphere,
+        wall_mm=0.5 * hollow_sphere.vertices_mm,
+        wall_triangles=hollow_sphere.triangles[:, ::-1],
+    )
+    radiosity = Radiosity(inner, Caster(inner), cell_mm=3.0)
+    direct = radiosity.direct([radiosity.lamp(np.eye(4), np.zeros(3), COSINE)], n=0.0, q=2.0)
+    np.testing.assert_allclose(direct[: radiosity.count], RADIUS_MM**-2.0, rtol=0.02)
+
+
+def test_no_patch_is_a_sliver(sphere, hollow_sphere):
+    corners = hollow_sphere.vertices_mm[hollow_sphere.triangles]
+    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2
+    assert np.bincount(sphere.patch_of, area).min() >= LEAST_AREA * sphere.cell_mm**2
 
 
 def test_a_lamp_at_the_centre_lights_a_sphere_evenly(sphere):

@@ -79,6 +79,14 @@ def test_an_array_that_a_surface_no_longer_has_is_passed_over(sphere, tmp_path):
     np.testing.assert_array_equal(Surface.load(tmp_path / "surface.safetensors").normals, surface.normals)
 
 
+def test_a_surface_of_an_older_file_has_no_wall(sphere, tmp_path):
+    arrays = vars(Surface.from_mesh(sphere.vertices, sphere.faces, sphere.vertices.astype(np.float32)))
+    older = {name: value for name, value in arrays.items() if "wall" not in name}
+    save_file(older, tmp_path / "surface.safetensors")
+    loaded = Surface.load(tmp_path / "surface.safetensors")
+    assert loaded.wall_mm.shape == loaded.wall_triangles.shape == (0, 3)
+
+
 def test_an_empty_mesh_is_a_surface():
     surface = Surface.from_mesh(np.zeros((0, 3)), np.zeros((0, 3), int), np.zeros((0, 3)))
     assert repr(surface) == "Surface(0 vertices, 0 triangles)"

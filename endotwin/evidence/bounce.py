@@ -17,8 +17,8 @@ from endotwin.pixels.start import PRIOR
 CELL = 0.15
 """Size of a patch as a share of the median viewing distance: 3 mm at 20 mm."""
 
-PROBE_CELLS, PROBE_RAYS = 2.0, 64
-"""The probe's patches are so many times larger, and each sends so many rays."""
+PROBE_RAYS = 64
+"""That each of the probe's patches sends."""
 
 PROBE_ALBEDOS = (0.55, 0.7, 0.85)
 """98th percentiles of the brightest channel that the probe tries: they tell how strong the bounce is."""
@@ -41,7 +41,7 @@ def bounced(probe: Probe, hypothesis: Hypothesis) -> Bounced:
     """
     n, q, gamma = PRIOR["n"], PRIOR["q"], PRIOR["gamma"]
     samples, roughness = probe.samples, torch.tensor(ROUGHNESS_TISSUE)
-    size_mm = PROBE_CELLS * cell_mm(samples.log_distance.numpy())
+    size_mm = cell_mm(samples.log_distance.numpy())
     radiosity = Radiosity(probe.twin.surface, probe.caster, size_mm, PROBE_RAYS)
     light = BouncedLight(radiosity, probe.T_local_camera, hypothesis.guides_mm, hypothesis.profile)
     places = Places(radiosity.to_points(probe.local_points_mm, probe.local_normals), probe.frame)

@@ -22,6 +22,7 @@ from endotwin.fusion.refine import refined
 from endotwin.fusion.smooth import smoothed
 from endotwin.fusion.tsdf import footprint_voxel_mm, fuse_tsdf
 from endotwin.fusion.views import Shelf, View, read_views
+from endotwin.fusion.wall import with_wall
 from endotwin.sequence import Sequence
 from endotwin.surface import Surface
 from endotwin.surface.casting import Caster
@@ -134,6 +135,7 @@ def fuse(
     if seen is not None:
         others = [glance for glance in seen if glance.index in set(photo_frames) - set(photos)]
         surface = covered_by_glances(camera, surface, others, sequence.lens_mask, tolerance)
+    surface = with_wall(camera, surface, views("close the lumen", fused), median_mm)
     if record is not None:
         record.update(fused=fused, nothing_new=len(frames) - len(fused))
     return surface

@@ -4,7 +4,7 @@ it.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +23,8 @@ class Surface:
         seen_by: int32 [V], number of training frames that see the vertex.
         nearest_mm: float32 [V], least distance to a camera that sees the vertex; inf where unseen.
         filled: bool [V], true where the surface was closed over a hole rather than measured.
+        wall_mm: float32 [W, 3], wall_triangles: int32 [U, 3] of these: the wall beyond what was measured, as
+            it may go on. No ray of a camera meets it; it throws light on the surface.
     """
 
     origin_mm: np.ndarray
@@ -32,6 +34,8 @@ class Surface:
     seen_by: np.ndarray
     nearest_mm: np.ndarray
     filled: np.ndarray
+    wall_mm: np.ndarray = field(default_factory=lambda: np.zeros((0, 3), np.float32))
+    wall_triangles: np.ndarray = field(default_factory=lambda: np.zeros((0, 3), np.int32))
 
     def __repr__(self) -> str:
         return f"Surface({len(self.vertices_mm):,} vertices, {len(self.triangles):,} triangles)"
@@ -80,6 +84,7 @@ class Surface:
 
     @classmethod
     def load(cls, path: Path) -> Surface:
-        """Read a file of what ``to_bytes`` gave; arrays that a surface no longer has are passed over."""
-        arrays = load_file(path)
-        return cls(**{field.name: arrays[field.name] for field in fields(cls)})
+        """Read a file of what ``to_bytes`` gave; arrays that a surface no longer has are passed over, and
+        older files have no wall."""
+        arrays, names = load_file(path), {field.name for field in fields(cls)}
+        return cls(**{name: array for name, array in arrays.items() if name in names})

@@ -34,12 +34,14 @@ def require_sound(twin: Twin) -> Twin:
     for name, (kind, columns) in SURFACE.items():
         shape = (3,) if columns is None else (count, columns)[: 2 if columns else 1]
         _require_array(name, getattr(surface, name), kind, shape)
-    triangles = surface.triangles
-    _require_array("triangles", triangles, np.int32, (len(triangles), 3))
-    _require("triangles", bool(((triangles >= 0) & (triangles < count)).all()))
-    for name in ("vertices_mm", "origin_mm", "normals"):
+    _require_array("wall_mm", surface.wall_mm, np.float32, (len(surface.wall_mm), 3))
+    for name, corners in (("triangles", count), ("wall_triangles", len(surface.wall_mm))):
+        triangles = getattr(surface, name)
+        _require_array(name, triangles, np.int32, (len(triangles), 3))
+        _require(name, bool(((triangles >= 0) & (triangles < corners)).all()))
+    for name in ("vertices_mm", "origin_mm", "normals", "wall_mm"):
         _require(name, bool(np.isfinite(getattr(surface, name)).all()))
-    if not len(triangles):
+    if not len(surface.triangles):
         raise ValueError("its surface is empty")
     size_mm = float(np.ptp(surface.vertices_mm.astype(np.float64), axis=0).max())
     if size_mm > LARGEST_MM:
@@ -54,10 +56,10 @@ def require_sound(twin: Twin) -> Twin:
     _require("the record", isinstance(twin.record, dict))
     fitted = [part is not None for part in (twin.materials, twin.light, twin.response)]
     _require("the fit", all(fitted) or not any(fitted))
-    ends = [0, *(end for polyp in twin.polyps for end in np.cumsum(polyp.triangles)), len(triangles)]
+    ends = [0, *(end for polyp in twin.polyps for end in np.cumsum(polyp.triangles)), len(surface.triangles)]
     _require("the place of a polyp", ends == sorted(ends) and len(twin.polyps) <= MOST_POLYPS)
     for fluid in twin.fluids:
-        ends = [0, *(end for run in fluid.triangles for end in np.cumsum(run)), len(triangles)]
+        ends = [0, *(end for run in fluid.triangles for end in np.cumsum(run)), len(surface.triangles)]
         _require("the place of a fluid", ends == sorted(ends))
     _require("the number of fluids", len(twin.fluids) <= MOST_FLUIDS)
     if all(fitted):

@@ -1,0 +1,86 @@
+"""The wall that closes a lumen: where the tissue is, off what was measured, and not between a camera and what
+it shows."""
+
+import numpy as np
+import pytest
+import trimesh
+
+from endotwin.cameras import Pinhole
+from endotwin.fusion.mesh import surface_of
+from endotwin.fusion.views import View
+from endotwin.fusion.wall import EDGE, GAP, with_wall
+from endotwin.surface.casting import Caster
+
+RADIUS_MM = 10.0
+LONGER = 1.6
+MEDIAN_MM = 2 * RADIUS_MM
+CAMERA = Pinhole(64, 64, 32.0, 32.0, 31.5, 31.5)
+
+
+@pytest.fixture(scope="module")
+def torn():
+    """An ellipsoid about the origin, longer along z, without all that lies more than .7 radii towards x."""
+    sphere = trimesh.creation.icosphere(subdivisions=5, radius=RADIUS_MM)
+    triangles = sphere.faces[sphere.triangles_center[:, 0] < 0.7 * RADIUS_MM, ::-1]
+    return surface_of(np.zeros(3), (sphere.vertices * [1, 1, LONGER]).astype(np.float32), triangles)
+
+
+def towards_minus_x(surface, x_mm):
+    """What a camera at ``x_mm`` on the x axis that looks back along it measures."""
+    pose = trimesh.transformations.rotation_matrix(-np.pi / 2, [0, 1, 0])
+    pose[0, 3] = x_mm
+    hits = Caster(surface).cast(CAMERA, pose)
+    return View(0, pose, hits.laid_out(hits.distance_mm, (CAMERA.height, CAMERA.width), np.nan))
+
+
+def walled(surface, x_mm=0.0):
+    return with_wall(CAMERA, surface, [towards_minus_x(surface, x_mm)], MEDIAN_MM)
+
+
+def met(surface):
+    """Share of the directions from the origin in which surface or wall is met from the front."""
+    vertices_mm = np.concatenate([surface.vertices_mm, surface.wall_mm])
+    triangles = np.concatenate([surface.triangles, surface.wall_triangles + len(surface.vertices_mm)])
+    whole = surface_of(np.zeros(3), vertices_mm, triangles)
+    rays = trimesh.creation.icosphere(subdivisions=4).vertices.astype(np.float32)
+    hit, _, _ = Caster(whole).cast_rays(np.zeros_like(rays), rays)
+    corners = whole.vertices_mm[whole.triangles[hit]]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    return ((hit >= 0) & (np.einsum("ra,ra->r", normals, rays) < 0)).mean()
+
+
+def test_the_wall_closes_an_ellipsoid_near_where_it_was(torn):
+    surface = walled(torn)
+    np.testing.assert_allclose(np.linalg.norm(surface.wall_mm / [1, 1, LONGER], axis=1), RADIUS_MM, rtol=0.15)
+    assert met(torn) < 0.86 < 0.95 < met(surface)
+
+
+def test_the_surface_itself_stays_as_it_is_and_the_wall_keeps_off_it(torn):
+    surface = walled(torn)
+    for name in ("vertices_mm", "triangles", "normals", "filled"):
+        assert getattr(surface, name) is getattr(torn, name)
+    middle_mm = surface.wall_mm[surface.wall_triangles].mean(axis=1)
+    gap_mm = np.linalg.norm(middle_mm[:, None] - torn.vertices_mm[None], axis=2).min(axis=1)
+    assert gap_mm.min() > GAP * EDGE * MEDIAN_MM
+
+
+def test_no_wall_shuts_a_camera_out_that_looks_in_from_outside(torn):
+    """As the first frame of an insertion, which the lumen's open end lies before."""
+    assert len(walled(torn).wall_triangles) > 50
+    surface, view = walled(torn, 1.3 * RADIUS_MM), towards_minus_x(torn, 1.3 * RADIUS_MM)
+    assert hidden(walled(torn), view) > 0.5
+    assert hidden(surface, view) == 0
+
+
+def hidden(surface, view):
+    """Of the pixels that measured something, the share that the wall lies before."""
+    wall = surface_of(np.zeros(3), surface.wall_mm, surface.wall_triangles)
+    hits = Caster(wall).cast(CAMERA, view.T_world_camera)
+    before = hits.distance_mm < view.distance_mm.reshape(-1)[hits.pixel]
+    return before.sum() / np.isfinite(view.distance_mm).sum()
+
+
+def test_the_same_surface_gets_the_same_wall(torn):
+    one, other = walled(torn), walled(torn)
+    assert one.wall_mm.tobytes() == other.wall_mm.tobytes()
+    assert one.wall_triangles.tobytes() == other.wall_triangles.tobytes()
