@@ -90,15 +90,14 @@ def told(folder: Path, photos: list[np.ndarray]) -> bool:
     return Interlacing.evidence(photos_of(folder, photos))[0] is not None
 
 
-@pytest.mark.parametrize("seed", [0, 100])
 @pytest.mark.parametrize("shift_px, noise_levels", [(0.3, 0), (0.3, 1), (1.0, 4), (6.0, 4)])
-def test_photos_of_a_moving_camera_tell_their_two_fields(tmp_path, seed, shift_px, noise_levels):
-    rng = np.random.default_rng(seed)
+def test_photos_of_a_moving_camera_tell_their_two_fields(tmp_path, shift_px, noise_levels):
+    rng = np.random.default_rng(0)
     angles = rng.uniform(0, 2 * np.pi, FRAMES)
     assert told(
         tmp_path,
         [
-            levels(woven(seed + k, shift_px * np.cos(a), shift_px * np.sin(a)), noise_levels, k)
+            levels(woven(k, shift_px * np.cos(a), shift_px * np.sin(a)), noise_levels, k)
             for k, a in enumerate(angles)
         ],
     )
@@ -108,14 +107,13 @@ def test_a_jpeg_codec_leaves_them_told(tmp_path):
     assert told(tmp_path, [jpeg(levels(woven(k, 2.0), 2, k), 75) for k in range(FRAMES)])
 
 
-@pytest.mark.parametrize("seed", [0, 100])
 @pytest.mark.parametrize("noise_levels", [1, 8])
 @pytest.mark.parametrize("sharpened", [None, (0.3, 4.0), (1.2, 1.0)])
 @pytest.mark.parametrize("quality", [None, 92])
-def test_photos_of_one_moment_tell_none(tmp_path, seed, noise_levels, sharpened, quality):
+def test_photos_of_one_moment_tell_none(tmp_path, noise_levels, sharpened, quality):
     photos = []
     for k in range(FRAMES):
-        color = levels(textured(seed + k), noise_levels, k) / np.float32(255)
+        color = levels(textured(k), noise_levels, k) / np.float32(255)
         if sharpened:
             color = Processor(0.0, sharpened[1], sharpened[0]).recorded(color)
         photos.append(levels(color) if quality is None else jpeg(levels(color), quality))
