@@ -89,11 +89,9 @@ def main() -> None:
         report(Path(folder).name, Path(folder), np.asarray(mesh.vertices), np.asarray(mesh.faces))
     with tempfile.TemporaryDirectory() as scratch:
         for seed in map(int, filter(None, options.seeds.split(","))):
-            folder, wall = (
-                (options.work or Path(scratch)) / f"{seed:04d}" / "all",
-                Studio(Scene.draw(seed)).wall,
-            )
-            make(Scene.draw(seed), folder)
+            scene, folder = Scene.draw(seed), (options.work or Path(scratch)) / f"{seed:04d}" / "all"
+            make(scene, folder)
+            wall = Studio(scene).wall
             report(f"seed {seed}", folder, wall.vertices_mm, wall.triangles)
 
 

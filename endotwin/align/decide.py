@@ -16,6 +16,7 @@ from endotwin.align.scene import Scene
 from endotwin.align.solve import Looked, look, step
 from endotwin.errors import OptionError
 from endotwin.sequence import Sequence
+from endotwin.sequence.spread import spread
 from endotwin.surface.casting import Caster
 from endotwin.twin import Registration, Twin
 
@@ -85,7 +86,7 @@ class Aligner:
         scale = min(1.0, WIDTH / twin.camera.width) * twin.source.scale
         self.sequence: Sequence = replace(twin.source, scale=scale).open()
         training = np.array(twin.source.training(len(self.sequence)))
-        self.frames = training[np.unique(np.linspace(0, len(training) - 1, PHOTOS).round().astype(int))]
+        self.frames = training[spread(len(training), PHOTOS)]
         judging = np.arange(len(self.frames)) % JUDGES == JUDGES // 2
         self.choosers, self.judges = self.frames[~judging], self.frames[judging]
         self.caster, self.camera = caster, self.sequence.camera
@@ -99,7 +100,7 @@ class Aligner:
     def asked_db(self) -> float:
         """By how much the photos' error would fall at a glance, if all were granted that some of them ask
         for."""
-        some = self.frames[np.unique(np.linspace(0, len(self.frames) - 1, GLANCE_PHOTOS).round().astype(int))]
+        some = self.frames[spread(len(self.frames), GLANCE_PHOTOS)]
         scene = Scene.of(self.caster, self.camera, GLANCE_VERTICES)
         now, blur_px = Corrections.none(self.sequence.T_world_camera), self.blur_px(BLURS[1])
         photos = self._read(some)

@@ -17,6 +17,7 @@ from endotwin.config import FuseConfig
 from endotwin.run.ahead import ahead
 from endotwin.run.threads import THREADS
 from endotwin.sequence import Sequence
+from endotwin.sequence.spread import spread
 from endotwin.surface import Surface
 from endotwin.surface.casting import Caster
 from endotwin.surface.vectors import dot, unit
@@ -87,7 +88,7 @@ def _one(caster: Caster, sequence: Sequence, pose: np.ndarray, frame: int) -> tu
 def gain_db(twin: Twin, sequence: Sequence, caster: Caster) -> float:
     """By how much the disagreement of some depth maps falls if each moves by itself, dB."""
     training = np.array(twin.source.training(len(sequence)))
-    some = training[np.unique(np.linspace(0, len(training) - 1, GLANCE_FRAMES).round().astype(int))]
+    some = training[spread(len(training), GLANCE_FRAMES)]
     poses = sequence.T_world_camera.copy()
     twists, before = disagreement(caster, sequence, poses, some)
     poses[some] = moved(poses[some], twists)

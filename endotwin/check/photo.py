@@ -19,6 +19,7 @@ import numpy as np
 from endotwin.check.depths import LEAST_COSINE, QUIET, prepared
 from endotwin.run.ahead import ahead
 from endotwin.sequence import Sequence
+from endotwin.sequence.spread import spread
 
 GRID = 320  # pixels across the reduced images that are correlated
 REACH = 12  # reduced pixels that photo and depth may lie apart
@@ -77,7 +78,7 @@ class Registration:
 
 def registration(sequence: Sequence, frames: np.ndarray) -> Registration:
     """Judge a few of ``frames`` [F] and their neighbours in time."""
-    centre = frames[np.unique(np.linspace(0, len(frames) - 1, FRAMES).round().astype(int))]
+    centre = frames[spread(len(frames), FRAMES)]
     wanted = sorted({f + k for f in centre.tolist() for k in SHIFTS if 0 <= f + k < len(sequence)})
     photos = dict(zip(wanted, ahead(lambda f: reduced_photo(sequence.color(f)), wanted, 2), strict=True))
     shadings = dict(

@@ -15,6 +15,7 @@ from endotwin.effects.effect import Effect
 from endotwin.effects.exposure import Shot
 from endotwin.effects.luma import LUMA
 from endotwin.sequence import Sequence
+from endotwin.sequence.spread import spread
 
 FIELDS = (-0.25, 0.25)
 """When the even and the odd rows are exposed, in frame intervals from the labelled pose."""
@@ -38,8 +39,8 @@ _ROW = np.arange(TILE_ROWS)
 _HANN = np.sin(np.pi * _ROW / TILE_ROWS) ** 2
 ALTERNATING = _HANN * np.cos(np.pi * _ROW)
 SLOWER = np.sqrt(2) * _HANN * np.cos(0.625 * np.pi * _ROW)
-"""Detail that changes sign from row to row, and at five eighths of that frequency: each
-of the same power in white noise."""
+"""Detail that changes sign from row to row, and at five eighths of that frequency: each of the same power in
+white noise."""
 
 BASIS = np.stack([ALTERNATING, SLOWER, _HANN, np.gradient(_HANN)], axis=1)
 
@@ -72,15 +73,15 @@ class Interlacing(Effect):
         across the rows as well as along them: combs must be beyond both an even chance and the columns'
         share, by Student's t of the frames' scatter, or of a coin's if that is more. A still camera has none.
         """
-        spread = np.unique(np.linspace(0, len(sequence) - 1, FRAMES).round().astype(int))
+        chosen = spread(len(sequence), FRAMES)
         lit = np.pad(sequence.lens_mask.astype(np.uint8), 1)
         lit = cv2.erode(lit, np.ones((2 * MARGIN_PX + 1,) * 2))[1:-1, 1:-1] > 0
-        across, along = zip(*(_details(sequence.color(index), lit) for index in spread), strict=True)
+        across, along = zip(*(_details(sequence.color(index), lit) for index in chosen), strict=True)
         (rows, rows_error, tiles), (columns, columns_error, _) = _share(across), _share(along)
         told = f"{rows:.0%} of the finest detail alternates by rows, {columns:.0%} by columns"
         rows_error = max(rows_error, 0.5 / np.sqrt(tiles))
-        least = stdtrit(len(spread) - 1, 1 - CHANCE) * np.hypot(rows_error, columns_error)
-        if len(spread) > 1 and rows - max(0.5, columns) > least:
+        least = stdtrit(len(chosen) - 1, 1 - CHANCE) * np.hypot(rows_error, columns_error)
+        if len(chosen) > 1 and rows - max(0.5, columns) > least:
             return cls(), f"the photos are combed: {told}"
         return None, f"rendered on request: the photos show no two fields of different moments ({told})"
 

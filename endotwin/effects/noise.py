@@ -14,6 +14,7 @@ from torch import Tensor
 
 from endotwin.effects.effect import Effect, parameter
 from endotwin.sequence import Sequence
+from endotwin.sequence.spread import spread
 
 LEVEL = 1 / 255
 """One step of an 8-bit image, in display values; rounding to it has the variance LEVEL²/12."""
@@ -68,8 +69,8 @@ class Noise(Effect):
     @classmethod
     def measured(cls, sequence: Sequence, frames: int = FRAMES) -> Noise | None:
         """The noise of ``frames`` photos spread over the sequence; see :meth:`measured_in`."""
-        spread = np.unique(np.linspace(0, len(sequence) - 1, frames).round().astype(int))
-        return cls.measured_in((sequence.color(index) for index in spread), sequence.lens_mask)
+        photos = (sequence.color(index) for index in spread(len(sequence), frames))
+        return cls.measured_in(photos, sequence.lens_mask)
 
     @classmethod
     def measured_in(cls, photos: Iterable[np.ndarray], mask: np.ndarray) -> Noise | None:

@@ -33,6 +33,7 @@ from endotwin.light.guides import lamps_mm
 from endotwin.pixels.samples import CLIPPED, Samples, Views, frame_samples
 from endotwin.run.ahead import ahead
 from endotwin.run.threads import THREADS
+from endotwin.sequence.spread import spread
 from endotwin.surface.rows import Rows
 from endotwin.surface.vectors import dot, unit
 
@@ -264,7 +265,7 @@ class _Found:
     def of(cls, model: Model, wet: FoundFilm, views: Views, report: Report) -> _Found:
         """Those of some of the photos kept apart."""
         rows = np.arange(APART // 2, len(views.frames), APART)
-        rows = rows[np.unique(np.linspace(0, len(rows) - 1, min(PHOTOS, len(rows))).round().astype(int))]
+        rows = rows[spread(len(rows), PHOTOS)]
         parts = []
 
         def one(row: int) -> _Found:

@@ -24,6 +24,7 @@ from endotwin.fusion.tsdf import footprint_voxel_mm, fuse_tsdf
 from endotwin.fusion.views import Shelf, View, read_views
 from endotwin.fusion.wall import with_wall
 from endotwin.sequence import Sequence
+from endotwin.sequence.spread import spread
 from endotwin.surface import Surface
 from endotwin.surface.casting import Caster
 
@@ -79,7 +80,7 @@ def fuse(
     if voxel_mm is not None and not voxel_mm > 0:
         raise OptionError(f"The voxel size is {voxel_mm:g} mm, but must be greater than 0.")
     sequence.require_valid_depth()
-    camera, sample = sequence.camera, _spread(frames)
+    camera, sample = sequence.camera, [frames[k] for k in spread(len(frames), SAMPLED_FRAMES)]
 
     reading: dict = {"shelf": Shelf()}
 
@@ -147,9 +148,3 @@ def _reported(stage: str, frames: list[int], progress: Progress | None) -> Itera
         if progress is not None:
             progress(stage, done, len(frames))
         yield index
-
-
-def _spread(frames: list[int]) -> list[int]:
-    """At most ``SAMPLED_FRAMES`` of ``frames``, evenly spread."""
-    chosen = np.unique(np.linspace(0, len(frames) - 1, min(len(frames), SAMPLED_FRAMES)).round().astype(int))
-    return [frames[index] for index in chosen]

@@ -92,7 +92,8 @@ class Radiosity:
         self._caster = caster
         self._lift_mm = LIFT * cell_mm
         generator = np.random.default_rng(seed)
-        corners, seen = _corners(surface), len(surface.triangles)
+        whole, seen = _with_wall(surface), len(surface.triangles)
+        corners = whole.vertices_mm[whole.triangles]
         normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         double_area = np.sqrt(dot(normal, normal))
         normal = normal / np.maximum(double_area, np.finfo(np.float32).tiny)[:, None]
@@ -105,7 +106,7 @@ class Radiosity:
         self.count = int(self.patch_of.max()) + 1
         patch = np.r_[pieces[0], self.count + pieces[1]]
         self._draw = _Draw(patch, double_area, int(patch.max()) + 1)
-        self._whole = Caster(_with_wall(surface)) if len(surface.wall_triangles) else caster
+        self._whole = Caster(whole) if len(surface.wall_triangles) else caster
         self.form_factors = self._counted(corners, normal, patch, rays, generator)
         met = np.asarray(self.form_factors.sum(axis=1)).ravel()
         self.unseen = ((1 - met) / np.maximum(met, LEAST_SEEN)).astype(np.float32)
@@ -171,11 +172,8 @@ class Radiosity:
         own = np.searchsorted(facing, self.count * POINTS)
         seen = np.zeros(len(cos), bool)
         for caster, some in ((self._caster, facing[:own]), (self._whole, facing[own:])):
-            origins, length_mm = (
-                np.broadcast_to(source, (len(some), 3)),
-                distance_mm[some] * (1 - SHADOW_BIAS),
-            )
-            seen[some] = caster.unobstructed(origins, ray[some], length_mm)
+            length_mm = distance_mm[some] * (1 - SHADOW_BIAS)
+            seen[some] = caster.unobstructed(np.broadcast_to(source, (len(some), 3)), ray[some], length_mm)
         shape = (-1, POINTS)
         axis = np.maximum(ray @ rotation[:, 2].astype(np.float32), COS_MIN)
         return Lamp(
@@ -257,12 +255,6 @@ def _grouped(group: np.ndarray, count: int) -> np.ndarray:
     """Stable order of members by ``group`` [N], int [N]: a counting sort."""
     members = np.arange(len(group))
     return scipy.sparse.csr_array((members, (group, members)), shape=(count, len(group))).data
-
-
-def _corners(surface: Surface) -> np.ndarray:
-    """Those of the triangles of the surface and, after them, of its wall, float32 [F + U, 3, 3]."""
-    wall = surface.wall_mm[surface.wall_triangles]
-    return np.concatenate([surface.vertices_mm[surface.triangles], wall])
 
 
 def _with_wall(surface: Surface) -> Surface:

@@ -14,6 +14,7 @@ import numpy as np
 from endotwin.cameras.base import Camera
 from endotwin.errors import SequenceError
 from endotwin.sequence.images import orientation, read_color
+from endotwin.sequence.spread import spread
 
 SURROUND_FRAMES = 8
 SURROUND_LEVEL = 3  # of 255, the brightest that noise makes a black pixel
@@ -151,9 +152,8 @@ class Sequence:
 
         Raises SequenceError if the photos looked at are all black.
         """
-        spread = np.unique(np.linspace(0, len(self) - 1, SURROUND_FRAMES).round().astype(int))
         brightest = np.zeros(self.image_size[::-1], np.uint8)
-        for index in spread:
+        for index in spread(len(self), SURROUND_FRAMES):
             np.maximum(brightest, self._native_color(index).max(axis=2), out=brightest)
         if brightest.max() <= SURROUND_LEVEL:
             raise SequenceError(f"{self.path} has only black photos; check that they show the lumen")

@@ -13,14 +13,13 @@ from scipy.spatial import cKDTree
 from endotwin.anatomy.optics import MUCUS, STOOL, WHOLE_BLOOD, Optics, blood
 from endotwin.anatomy.wet import Puddle, Wetted, hollows_mm
 from endotwin.cameras import Camera
-from endotwin.errors import OptionError, TwinError
+from endotwin.errors import OptionError
 from endotwin.run.streams import Stream
 from endotwin.surface.casting import Caster
 from endotwin.surface.vectors import unit
 from endotwin.synth.trajectories import Trajectory
 from endotwin.synth.trajectories.trajectory import parse_options
-from endotwin.synth.trajectories.wall_point import WallPoint
-from endotwin.synth.wall import Wall
+from endotwin.synth.wall import Several, Wall, one_by_one
 from endotwin.twin import Twin
 from endotwin.twin.fluids import MOST_FLUIDS
 
@@ -57,14 +56,13 @@ FLUIDS = {
 
 
 @dataclass(frozen=True)
-class FluidOptions(WallPoint):
+class FluidOptions(Several):
     """Options of any fluid."""
 
     size: float = field(default=10.0, metadata={"help": "greatest extent along the wall, mm"})
     thickness: float = field(
         default=0.0, metadata={"help": "greatest, of a pool its depth, mm; 0: the usual one"}
     )
-    count: int = field(default=1, metadata={"help": "number of such patches"})
     pool: bool = field(default=False, metadata={"help": "whether it stands level in a hollow"})
     haemoglobin: float = field(default=WHOLE_BLOOD, metadata={"help": "of blood, g/L: less where diluted"})
     gx: float = field(default=0.0, metadata={"help": "way that gravity pulls, world axes", "signed": True})
@@ -100,12 +98,8 @@ def with_fluids(
     Raises:
         TwinError: the twin is not fitted. OptionError: a fluid is not understood, or finds no place.
     """
-    if not twin.fitted:
-        raise TwinError("the twin has no materials yet; run 'endotwin fit' on it first")
-    asked = [(spec, *parse_fluid(spec)) for spec in ([specs] if isinstance(specs, str) else specs)]
-    if len(twin.fluids) + sum(options.count for *_, options in asked) > MOST_FLUIDS:
-        raise OptionError(f"{MOST_FLUIDS} patches of fluid lie on a twin at most; ask for fewer")
-    each = [(spec, kind, options) for spec, kind, options in asked for _ in range(options.count)]
+    full = f"{MOST_FLUIDS} patches of fluid lie on a twin at most; ask for fewer"
+    each = one_by_one(twin, specs, parse_fluid, MOST_FLUIDS - len(twin.fluids), full)
     wall, wetted = Wall(twin, trajectory, camera or twin.camera, Caster(twin.surface)), Wetted(twin)
     for k, one in enumerate(each):
         _spill(wetted, wall, one[2].down(trajectory), *one, Stream.FLUID.generator(seed, k))
@@ -125,8 +119,7 @@ def parse_fluid(spec: str) -> tuple[str, FluidOptions]:
     most_mm = options.size / 2 if options.pool else FLUIDS[kind].most_mm
     if options.thickness and not THINNEST_MM <= options.thickness <= most_mm:
         raise OptionError(f"fluid {spec!r}: its thickness lies between {THINNEST_MM:g} and {most_mm:g} mm")
-    if options.count < 1 or (options.placed and options.count > 1):
-        raise OptionError(f"fluid {spec!r}: count is at least 1, and 1 where a place is given")
+    options.require_count(f"fluid {spec!r}")
     if options.haemoglobin != WHOLE_BLOOD and kind != "blood":
         raise OptionError(f"fluid {spec!r}: only blood has haemoglobin")
     return kind, options

@@ -12,14 +12,13 @@ import scipy.sparse
 from endotwin.anatomy import CLASSES, Seedling, Site, grown
 from endotwin.anatomy.shape import Shape
 from endotwin.cameras import Camera
-from endotwin.errors import OptionError, TwinError
+from endotwin.errors import OptionError
 from endotwin.run.streams import Stream
 from endotwin.surface.casting import Caster
 from endotwin.surface.vectors import dot
 from endotwin.synth.trajectories import Trajectory
 from endotwin.synth.trajectories.trajectory import parse_options
-from endotwin.synth.trajectories.wall_point import WallPoint
-from endotwin.synth.wall import Wall
+from endotwin.synth.wall import Several, Wall, one_by_one
 from endotwin.twin import Twin
 from endotwin.twin.polyps import MOST_POLYPS
 
@@ -30,14 +29,13 @@ TRIES = 400
 
 
 @dataclass(frozen=True)
-class PolypOptions(WallPoint):
+class PolypOptions(Several):
     """Options of a polyp of any class."""
 
     size: float = field(default=6.0, metadata={"help": "greatest diameter, of the head of a stalk, mm"})
     height: float = field(
         default=0.0, metadata={"help": "above the wall, mm; 0: the class's usual one", "signed": True}
     )
-    count: int = field(default=1, metadata={"help": "number of such polyps"})
     ihb: float = field(
         default=2.9, metadata={"help": "index of haemoglobin above that of the wall", "signed": True}
     )
@@ -60,14 +58,10 @@ def with_polyps(
     Raises:
         TwinError: the twin is not fitted. OptionError: a polyp is not understood, or does not fit.
     """
-    if not twin.fitted:
-        raise TwinError("the twin has no materials yet; run 'endotwin fit' on it first")
     if twin.fluids:
         raise OptionError("fluids lie on this twin already; grow polyps on the one without them")
-    asked = [(spec, *parse_polyp(spec)) for spec in ([specs] if isinstance(specs, str) else specs)]
-    if len(twin.polyps) + sum(options.count for *_, options in asked) > MOST_POLYPS:
-        raise OptionError(f"a twin holds {MOST_POLYPS} polyps at most; ask for fewer")
-    each = [(spec, kind, options) for spec, kind, options in asked for _ in range(options.count)]
+    full = f"a twin holds {MOST_POLYPS} polyps at most; ask for fewer"
+    each = one_by_one(twin, specs, parse_polyp, MOST_POLYPS - len(twin.polyps), full)
     garden = _Garden(twin, trajectory, camera or twin.camera)
     seedlings = [garden.seedling(*one, Stream.POLYP.generator(seed, k)) for k, one in enumerate(each)]
     return grown(twin, seedlings)
@@ -90,8 +84,7 @@ def parse_polyp(spec: str) -> tuple[str, PolypOptions]:
         raise OptionError(
             f"polyp {spec!r}: {kind} of {options.size:g} mm is {low:g} to {high:g} mm high (Paris classes)"
         )
-    if options.count < 1 or (options.placed and options.count > 1):
-        raise OptionError(f"polyp {spec!r}: count is at least 1, and 1 where a place is given")
+    options.require_count(f"polyp {spec!r}")
     return kind, options
 
 

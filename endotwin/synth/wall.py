@@ -1,15 +1,16 @@
-"""Places of the wall on which something is to be: given ones, or drawn where a trajectory sees them well."""
+"""What is to be on the wall, and its places: given ones, or drawn where a trajectory sees them well."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from endotwin.cameras import Camera
-from endotwin.errors import OptionError
+from endotwin.errors import OptionError, TwinError
 from endotwin.surface import Surface
 from endotwin.surface.casting import Caster
 from endotwin.surface.vectors import dot, unit
@@ -28,6 +29,41 @@ FARTHEST_MM = 60.0
 
 OFF_MM = 2.0
 """A point that is given lies on the wall if it is no farther from it."""
+
+
+@dataclass(frozen=True)
+class Several(WallPoint):
+    """Options of one or several things of a kind on the wall."""
+
+    count: int = field(default=1, metadata={"help": "number of such"})
+
+    def require_count(self, what: str) -> None:
+        """Raises OptionError where none is asked for, or several at one place."""
+        if self.count < 1 or (self.placed and self.count > 1):
+            raise OptionError(f"{what}: count is at least 1, and 1 where a place is given")
+
+
+Asked = tuple[str, str, Several]
+
+
+def one_by_one(
+    twin: Twin,
+    specs: Iterable[str] | str,
+    parse: Callable[[str], tuple[str, Several]],
+    room: int,
+    full: str,
+) -> list[Asked]:
+    """The spec, the kind and the options of each thing that ``specs`` ask for, as ``parse`` tells them.
+
+    Raises:
+        TwinError: the twin is not fitted. OptionError: there are more than ``room``, with the text ``full``.
+    """
+    if not twin.fitted:
+        raise TwinError("the twin has no materials yet; run 'endotwin fit' on it first")
+    asked = [(spec, *parse(spec)) for spec in ([specs] if isinstance(specs, str) else specs)]
+    if sum(options.count for *_, options in asked) > room:
+        raise OptionError(full)
+    return [one for one in asked for _ in range(one[2].count)]
 
 
 class Wall:

@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-import numpy as np
-
 from endotwin.run.ahead import ahead
 from endotwin.run.threads import THREADS
+from endotwin.sequence.spread import spread
 from endotwin.synth.proof.between import between
 from endotwin.synth.proof.claims import Proof, Tally
 from endotwin.synth.proof.warp import Frame
@@ -32,7 +31,7 @@ def prove(
         SequenceError: there is no dataset, or a file of it is missing or damaged.
     """
     written = dataset if isinstance(dataset, Written) else Written.open(dataset)
-    firsts = _spread(max(len(written) - 1, 1), pairs)
+    firsts = spread(max(len(written) - 1, 1), pairs)
     tally, kept = Tally(), Frame(written, int(firsts[0]))
     threads = 1 if written.layout.packed else THREADS  # a tar is read at one place at a time
     try:
@@ -49,8 +48,3 @@ def prove(
     finally:
         written.close()
     return tally.proof(len(written), len(firsts))
-
-
-def _spread(count: int, most: int) -> np.ndarray:
-    """At most ``most`` numbers below ``count``, even."""
-    return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(int))
