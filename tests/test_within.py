@@ -9,6 +9,7 @@ import torch
 from endotwin.effects import Decision
 from endotwin.effects.coat import Coat
 from endotwin.evidence.coat import judged
+from endotwin.fit.gauss_newton import ROUGHNESS_RANGE, roughness_to_raw
 from endotwin.fit.model import Globals, predict
 from endotwin.fit.within import Varied, Within
 from endotwin.pixels.samples import Samples, Views
@@ -82,6 +83,20 @@ def test_tissue_without_a_coat_gets_none_and_one_that_is_forced_on_weighs_nothin
     assert judged(within.highlights(material, TRUE, NOISE), "off") == (None, Decision("off", "forced off"))
     forced, decision = judged(within.highlights(material, TRUE, NOISE), "on")
     assert decision.state == "on" and forced.weight < 0.02
+
+
+def test_roughness_that_is_off_everywhere_is_found_with_f0_and_is_no_coat():
+    within, material = photographed()
+    shared, logit = TRUE, torch.tensor(roughness_to_raw(0.55))
+    low, high = ROUGHNESS_RANGE
+    material[:, 3] = low + (high - low) * torch.sigmoid(logit)
+    assert judged(within.highlights(material, shared, NOISE), "auto")[0] is None
+    for _ in range(6):
+        found = within.shone(material, shared, NOISE)
+        shared, logit = found.shared, logit + found.roughness
+        material[:, 3] = low + (high - low) * torch.sigmoid(logit)
+    assert float(material[0, 3]) == pytest.approx(ROUGHNESS, rel=0.01)
+    assert told(shared) == pytest.approx(told(TRUE), rel=0.01)
 
 
 def test_gains_that_follow_the_distance_are_told_from_the_falloff():

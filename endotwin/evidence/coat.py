@@ -8,18 +8,22 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+from scipy.stats import chi2
 
 from endotwin.effects import Decision
 from endotwin.effects.coat import Coat
 from endotwin.evidence.probe import Verdict, compared
 from endotwin.pixels.fixed_effects import Design, regress, robust_losses
 
-ROUGHNESSES = (0.06, 0.09, 0.13, 0.19, 0.27)
+ROUGHNESSES = (0.045, 0.06, 0.09, 0.13, 0.19, 0.27)
 TAILS = (2.0, 1.0)
 LEAST_SIGHTINGS = 16
 
 SEARCH_ROUNDS = 2
 """Of the regression by which roughnesses are ranked."""
+
+WORTH = chi2.isf(0.01 / (len(ROUGHNESSES) * len(TAILS)), df=1) / 2
+"""Log likelihood by which the best of as many lobes beats none in one of a hundred bare tissues."""
 
 
 @dataclass(frozen=True)
@@ -27,20 +31,20 @@ class Highlights:
     """Sightings of vertices near the mirror direction, S of them, beside a prediction without a coat.
 
     Attributes:
-        vertex: int [S]. residual: ln photo − ln prediction [S]. by_f0, by_coat: d ln C by ln f0 and by the
-            weight of a coat [S].
+        vertex: int [S]. residual: ln photo − ln prediction [S]. by_tissue: d ln C by ln f0 and by the
+            logit of roughness [S, 2]. by_coat: and by the weight of a coat [S].
     """
 
     vertex: np.ndarray
     residual: np.ndarray
-    by_f0: np.ndarray
+    by_tissue: np.ndarray
     by_coat: np.ndarray
 
     @cached_property
     def design(self) -> Design:
-        """f0 and coat, beside an intercept a vertex."""
+        """f0, roughness and coat, beside an intercept a vertex."""
         vertex = np.unique(self.vertex, return_inverse=True)[1].reshape(-1)
-        return Design(np.c_[self.by_f0, self.by_coat], vertex, int(vertex.max()) + 1)
+        return Design(np.c_[self.by_tissue, self.by_coat], vertex, int(vertex.max()) + 1)
 
 
 def judged(under: Callable[[Coat], Highlights], wanted: str) -> tuple[Coat | None, Decision]:
@@ -68,21 +72,26 @@ def best_coat(under: Callable[[Coat], Highlights]) -> tuple[Coat, Verdict]:
 
     Lobes are ranked by what they leave after a second step: a coat may outshine what is under it, where the
     logarithm is far from linear in its weight, and only one that shines can be held against clipped photos.
+    One that hardly any sighting could have seen weighs nothing.
     """
     width, least, best = 0.0, np.inf, None
     for lobe in (Coat(0.0, roughness, tail) for tail in TAILS for roughness in ROUGHNESSES):
         seen = under(lobe)
         if len(seen.residual) < LEAST_SIGHTINGS:
             break
-        width = width or regress(seen.residual, _bare(seen.design)).width
-        weight = float(regress(seen.residual, seen.design, rounds=SEARCH_ROUNDS).coefficients[1])
+        if not width:
+            bare = regress(seen.residual, _bare(seen.design))
+            width = bare.width
+            losses = robust_losses(seen.residual, _bare(seen.design), bare, width)
+            least = float(losses.sum()) - WORTH * width**2
+        weight = float(regress(seen.residual, seen.design, rounds=SEARCH_ROUNDS).coefficients[-1])
         if weight <= 0:
             continue
         near = under(replace(lobe, weight=weight))
         found = regress(near.residual, near.design, rounds=SEARCH_ROUNDS)
         loss = float(robust_losses(near.residual, near.design, found, width).sum())
         if loss < least:
-            least, best = loss, (replace(lobe, weight=weight + float(found.coefficients[1])), seen)
+            least, best = loss, (replace(lobe, weight=weight + float(found.coefficients[-1])), seen)
     if best is None:
         return Coat(0.0), Verdict(0.0, 0.0)
     coat, seen = best
@@ -93,4 +102,4 @@ def best_coat(under: Callable[[Coat], Highlights]) -> tuple[Coat, Verdict]:
 
 def _bare(design: Design) -> Design:
     """``design`` without its coat."""
-    return replace(design, columns=design.columns[:, :1])
+    return replace(design, columns=design.columns[:, :-1])

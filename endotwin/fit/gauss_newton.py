@@ -38,7 +38,7 @@ HUBER = 1.0
 
 ROUGHNESS_RANGE = (0.08, 1.0)
 COLOR_SPREAD = 0.5
-ROUGHNESS_SPREAD = 0.1
+ROUGHNESS_LOGIT_SPREAD = 0.1 * 4 / (ROUGHNESS_RANGE[1] - ROUGHNESS_RANGE[0])
 """Standard deviation of a table entry of a COARSE_MM cell: base colour, roughness."""
 
 COARSE_MM = 12.0
@@ -120,13 +120,17 @@ def roughness_to_raw(roughness: float) -> float:
     return float(np.log(share / (1 - share)))
 
 
+def roughness_slope(roughness: Tensor) -> Tensor:
+    """d roughness / d logit."""
+    low, high = ROUGHNESS_RANGE
+    return (roughness - low) * (high - roughness) / (high - low)
+
+
 def prior_precision(operator: HashOperator, unit_mm: float) -> Tensor:
     """Inverse prior variance of each table entry, float32 [R, 4]."""
     cell = torch.from_numpy(operator.cells_mm[operator.level] / (unit_mm * COARSE_MM)).float()
-    low, high = ROUGHNESS_RANGE
-    link = (high - low) / 4
     color = 1 / (COLOR_SPREAD**2 * cell)
-    roughness = 1 / ((ROUGHNESS_SPREAD / link) ** 2 * cell**2)
+    roughness = 1 / (ROUGHNESS_LOGIT_SPREAD**2 * cell**2)
     return torch.stack([color, color, color, roughness], dim=1)
 
 

@@ -268,11 +268,12 @@ def _find_light(
             shared = replace(shared, coat=layer)
         if relighting.bounces:
             solver.held = (*start.undetermined, "L0", *(("albedo scale",) * (number < HOLD_STEPS)))
+            found = within.shone(material, shared, noise)
         else:
             found = within.renewed(material, shared, start.undetermined, noise, relighting.varied)
             relighting.vary(solver, found)
-            shared = found.shared
-        state = replace(state, shared=shared)
+        mean = state.mean + torch.tensor([0.0, 0.0, 0.0, found.roughness])
+        state = replace(state, shared=found.shared, mean=mean)
         if late:
             break
         state, gain = _stepped(solver, state, relighting, joint=relighting.bounces)

@@ -22,7 +22,14 @@ from torch import Tensor
 
 from endotwin.effects.coat import Coat
 from endotwin.evidence.coat import LEAST_SIGHTINGS, Highlights
-from endotwin.fit.gauss_newton import TEMPER, bounded, free_directions, global_prior
+from endotwin.fit.gauss_newton import (
+    ROUGHNESS_LOGIT_SPREAD,
+    TEMPER,
+    bounded,
+    free_directions,
+    global_prior,
+    roughness_slope,
+)
 from endotwin.fit.model import GLOBALS, Globals, linearise, predict
 from endotwin.light import shading
 from endotwin.pixels.fixed_effects import Design, regress
@@ -73,12 +80,13 @@ STILL = Varied()
 
 @dataclass(frozen=True)
 class Renewed:
-    """What a step has found: ``shared``, and what it adds to ln of each frame's gain, float64 [frames], and
-    to the guides' places, float64 [guides, 3], mm."""
+    """What a step has found: ``shared``, and what it adds to ln of each frame's gain, float64 [frames], to
+    the guides' places, float64 [guides, 3], mm, and to the logit of all roughness."""
 
     shared: Globals
     log_gain: np.ndarray
     aside_mm: np.ndarray
+    roughness: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -87,14 +95,16 @@ class Sightings:
 
     Attributes:
         vertex, frame: int [S]. residual: ln photo − ln prediction [S]. slopes: d ln C by the shared
-            parameters [S, G]. by_coat: d ln C by the coat's weight [S], 0 without one. by_guides: d ln C by
-            the guides' places, 1/mm [S, 3K]. weight: inverse variance [S].
+            parameters [S, G]. by_roughness: d ln C by the logit of roughness [S]. by_coat: d ln C by the
+            coat's weight [S], 0 without one. by_guides: d ln C by the guides' places, 1/mm [S, 3K]. weight:
+            inverse variance [S].
     """
 
     vertex: np.ndarray
     frame: np.ndarray
     residual: np.ndarray
     slopes: np.ndarray
+    by_roughness: np.ndarray
     by_coat: np.ndarray
     by_guides: np.ndarray
     weight: np.ndarray
@@ -131,8 +141,13 @@ class Within:
         found = self._step(material, shared, (*held, "level", "f0"), diffuse, noise, varied)
         if not shared.specular:
             return found
-        kept, every = ("level", "n", "q", "gamma"), torch.ones_like(diffuse)
-        return replace(found, shared=self._step(material, found.shared, kept, every, noise).shared)
+        shone = self.shone(material, found.shared, noise)
+        return replace(found, shared=shone.shared, roughness=shone.roughness)
+
+    def shone(self, material: Tensor, shared: Globals, noise: float) -> Renewed:
+        """A step of f0, roughness and the coat, which pass for one another, together."""
+        kept = ("level", "n", "q", "gamma", *(("albedo scale",) * shared.bounces))
+        return self._step(material, shared, kept, torch.ones(len(self.samples), dtype=torch.bool), noise)
 
     def highlights(self, material: Tensor, shared: Globals, noise: float) -> Callable[[Coat], Highlights]:
         """Sightings near the mirror direction, by a coat of weight 0 over them.
@@ -145,7 +160,8 @@ class Within:
 
         def under(coat: Coat) -> Highlights:
             seen = self.sightings(material, replace(shared, coat=coat), shiny, noise)
-            return Highlights(seen.vertex, seen.residual, seen.slopes[:, F0], seen.by_coat)
+            nuisance = np.c_[seen.slopes[:, F0], seen.by_roughness]
+            return Highlights(seen.vertex, seen.residual, nuisance, seen.by_coat)
 
         return under
 
@@ -163,26 +179,26 @@ class Within:
         if not free.shape[1] or len(seen.residual) < LEAST_SIGHTINGS:
             return Renewed(shared, np.zeros(varied.frames), np.zeros((varied.guides, 3)))
         frame = np.searchsorted(self.samples.views.frames, seen.frame) if varied.frames else None
-        coated = "f0" not in held and shared.coat is not None
-        columns, prior = self._columns(seen, shared, free, coated)
+        columns, prior = self._columns(seen, shared, free, shiny="f0" not in held)
         design = Design(columns, seen.vertex, self.count, frame, seen.weight, prior)
         found = regress(seen.residual, design, varied.frames, rounds=REWEIGHTS)
-        along = free @ found.coefficients[: free.shape[1]]
-        spread = global_prior(self.unit_mm, len(shared.vector))[1].numpy()
-        length = min(1.0, float((spread / np.maximum(np.abs(along), 1e-12)).min()))
-        if coated:
-            weight = max(0.0, shared.coat.weight + length * float(found.coefficients[-1]))
+        count, guides = free.shape[1], seen.by_guides.shape[1]
+        along, places, shine = np.split(found.coefficients, [count, count + guides])
+        along, rougher = free @ along, shine[:1].sum()
+        spread = np.r_[global_prior(self.unit_mm, len(shared.vector))[1].numpy(), ROUGHNESS_LOGIT_SPREAD]
+        length = min(1.0, float((spread / np.maximum(np.abs(np.r_[along, rougher]), 1e-12)).min()))
+        if len(shine) > 1:
+            weight = max(0.0, shared.coat.weight + length * float(shine[1]))
             shared = replace(shared, coat=replace(shared.coat, weight=weight))
-        places = found.coefficients[free.shape[1] :][: 3 * varied.guides].reshape(-1, 3)
         log_gain = found.intercepts / shared.gamma if varied.frames else np.zeros(0)
         moved = bounded(shared, shared.vector + torch.from_numpy(length * along))
-        return Renewed(moved, length * log_gain, length * places)
+        return Renewed(moved, length * log_gain, length * places.reshape(-1, 3), length * float(rougher))
 
     def _columns(
-        self, seen: Sightings, shared: Globals, free: np.ndarray, coated: bool
+        self, seen: Sightings, shared: Globals, free: np.ndarray, shiny: bool
     ) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]:
-        """Columns of the ``free`` directions, of the guides' places, and of the coat where it is sought; and
-        what is known of their coefficients."""
+        """Columns of the ``free`` directions, of the guides' places and, of what is ``shiny``, of roughness
+        and of a coat; and what is known of their coefficients."""
         mean, spread = (x.numpy() for x in global_prior(self.unit_mm, len(shared.vector)))
         guides = seen.by_guides.shape[1]
         parts = [
@@ -191,7 +207,11 @@ class Within:
         ]
         pulls = [free.T @ (TEMPER * (mean - shared.vector.numpy()) / spread**2), np.zeros(guides)]
         columns = [seen.slopes @ free, seen.by_guides]
-        if coated:
+        if shiny:
+            columns.append(seen.by_roughness[:, None])
+            parts.append(TEMPER / ROUGHNESS_LOGIT_SPREAD**2)
+            pulls.append([0.0])
+        if shiny and shared.coat is not None:
             columns.append(seen.by_coat[:, None])
             parts.append(TEMPER / COAT_SPREAD**2)
             pulls.append([-TEMPER * shared.coat.weight / COAT_SPREAD**2])
@@ -230,15 +250,17 @@ class Within:
         by_guides = (
             self._by_guides(rows, material, shared, varied, model.predicted[bright], tells) / predicted
         )
+        by_raw = roughness_slope(material[rows, 3])[:, None]
+        by_roughness = (model.by_roughness[bright] * by_raw * tells).mean(dim=1).numpy() / predicted
         weight = 1 / ((noise / predicted) ** 2 + MODEL_ERROR**2)
         place = self.vertex[rows.numpy()].astype(np.int64) << 32 | self.samples.frame[rows].numpy()
         place, which = np.unique(place, return_inverse=True)
         total = np.bincount(which, weight, len(place))
-        averaged = (residual, by_coat, *slopes.T, *by_guides)
+        averaged = (residual, by_roughness, by_coat, *slopes.T, *by_guides)
         means = [np.bincount(which, weight * column, len(place)) / total for column in averaged]
-        slopes, by_guides = np.split(np.stack(means[2:], axis=1), [slopes.shape[1]], axis=1)
+        slopes, by_guides = np.split(np.stack(means[3:], axis=1), [slopes.shape[1]], axis=1)
         frame = (place & 0xFFFFFFFF).astype(np.int32)
-        return Sightings(place >> 32, frame, means[0], slopes, means[1], by_guides, total)
+        return Sightings(place >> 32, frame, means[0], slopes, *means[1:3], by_guides, total)
 
     def _by_guides(
         self,
