@@ -79,25 +79,33 @@ def best_coat(under: Callable[[Coat], Highlights]) -> tuple[Coat, Verdict]:
         seen = under(lobe)
         if len(seen.residual) < LEAST_SIGHTINGS:
             break
-        if not width:
-            bare = regress(seen.residual, _bare(seen.design))
-            width = bare.width
-            losses = robust_losses(seen.residual, _bare(seen.design), bare, width)
-            least = float(losses.sum()) - WORTH * width**2
-        weight = float(regress(seen.residual, seen.design, rounds=SEARCH_ROUNDS).coefficients[-1])
-        if weight <= 0:
+        width = width or regress(seen.residual, _bare(seen.design)).width
+        bare, first = (_fitted(seen.residual, design, width) for design in (_bare(seen.design), seen.design))
+        if first.weight <= 0 or first.loss > bare.loss - WORTH * width**2:
             continue
-        near = under(replace(lobe, weight=weight))
-        found = regress(near.residual, near.design, rounds=SEARCH_ROUNDS)
-        loss = float(robust_losses(near.residual, near.design, found, width).sum())
-        if loss < least:
-            least, best = loss, (replace(lobe, weight=weight + float(found.coefficients[-1])), seen)
+        near = under(replace(lobe, weight=first.weight))
+        second = _fitted(near.residual, near.design, width)
+        if second.loss < least:
+            least, best = second.loss, (replace(lobe, weight=first.weight + second.weight), seen)
     if best is None:
         return Coat(0.0), Verdict(0.0, 0.0)
     coat, seen = best
     half = (np.random.default_rng(0).random(seen.design.count) < 0.5)[seen.design.group]
     verdict = compared(seen.residual, _bare(seen.design), seen.design, half, width)
     return replace(coat, weight=max(0.0, coat.weight)), verdict
+
+
+@dataclass(frozen=True)
+class _Fitted:
+    """The coat's weight, and the sum of the losses beside it."""
+
+    weight: float
+    loss: float
+
+
+def _fitted(residual: np.ndarray, design: Design, width: float) -> _Fitted:
+    found = regress(residual, design, rounds=SEARCH_ROUNDS)
+    return _Fitted(float(found.coefficients[-1]), float(robust_losses(residual, design, found, width).sum()))
 
 
 def _bare(design: Design) -> Design:
