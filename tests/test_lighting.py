@@ -9,12 +9,13 @@ import tube_twin
 
 from endotwin.effects import Effects
 from endotwin.effects.gain import Gain
+from endotwin.effects.interreflection import Interreflection
 from endotwin.effects.offset import Offset
 from endotwin.effects.shadows import Shadows
 from endotwin.effects.specular import Specular
-from endotwin.fit.gauss_newton import GaussNewton
-from endotwin.fit.lighting import Relighting, lit, settled
-from endotwin.fit.model import at_pixels
+from endotwin.fit.gauss_newton import GaussNewton, recolored
+from endotwin.fit.lighting import Asked, Relighting, lit
+from endotwin.fit.model import Globals, at_pixels, predict
 from endotwin.fit.within import Within
 from endotwin.surface.casting import Caster
 
@@ -116,15 +117,44 @@ def test_bright_tissue_and_the_light_that_it_throws_settle_where_they_agree():
     photo = albedo / (1 - albedo)
     calm = swinging = np.array([0.8, 0.5, 0.3])
     for _ in range(12):
-        target = torch.from_numpy(np.log(tissue_under(calm, photo)))
-        growth = torch.from_numpy(calm / (1 - calm))
-        calm = settled(torch.from_numpy(np.log(calm)), target, growth, scaled=False).exp().numpy()
+        light, by_color, found = (
+            calm / (1 - calm),
+            1 / (1 - calm),
+            np.minimum(tissue_under(calm, photo), 0.95),
+        )
+        asked = Asked(None, np.log(light), share=calm, by_color=by_color)
+        light = np.exp(asked.settled(np.log(found / (1 - found)))[0])
+        calm = light / (1 + light)
         swinging = np.clip(tissue_under(swinging, photo), 0, 0.99)
     np.testing.assert_allclose(calm, albedo, rtol=1e-3)
     assert np.abs(swinging - albedo)[0] > 0.3
 
 
-def test_a_scale_that_was_found_is_taken_at_once_and_a_tint_in_part():
-    level, tint = torch.zeros(3), torch.tensor([0.3, -0.1, -0.2])
-    found = settled(level, 0.5 + tint, growth=torch.full((3,), 1.0), scaled=True)
-    np.testing.assert_allclose(found, 0.5 + tint / 2, rtol=1e-6)
+@pytest.mark.slow
+def test_colours_at_rest_throw_the_light_beside_which_they_were_found():
+    """A step has changed the tube's colours, brighter on one side, beside the light that they threw before:
+    so the photos look then, and so they are to look by the light of the colours themselves."""
+    twin = tube_twin.fitted(tube_twin.seen(tube_twin.surface(fold_mm=2.0)))
+    effects = Effects([Specular(), Interreflection(cell_mm=2.0)])
+    poses = np.stack([tube_twin.pose(s) for s in np.linspace(0.3, 0.7, 4)])
+    samples = tube_twin.photographed(twin, tube_twin.CAMERA, poses)
+    state = tube_twin.state_of(
+        replace(twin, materials=replace(twin.materials, metallic=0 * twin.materials.metallic))
+    )
+    shared = Globals.of(twin.light, twin.response, twin.materials.f0, bounce=True)
+    state = replace(state, shared=shared)
+    relighting = Relighting(twin.surface, Caster(twin.surface), effects, samples.views)
+    solver = GaussNewton(samples, twin.surface.triangles, state.operator)
+    relighting(solver, state)
+
+    def shown(samples, state):
+        return predict(samples, at_pixels(samples, solver.triangles, state.materials), state.shared)
+
+    side = torch.from_numpy(np.tanh(twin.surface.vertices_mm[:, :1] / 5))
+    stepped = recolored(state, (0.1 * side + torch.tensor([0.15, 0.1, 0.05])).float())
+    relighting.asked(solver, stepped)
+    wanted = shown(solver.samples, stepped)
+    own = shown(relighting.relit(solver.samples, solver.triangles, stepped), stepped) - wanted
+    rested = relighting.at_rest(solver, stepped)
+    left = shown(relighting.relit(solver.samples, solver.triangles, rested), rested) - wanted
+    assert left.square().mean().sqrt() < 0.2 * own.square().mean().sqrt()

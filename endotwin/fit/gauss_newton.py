@@ -411,6 +411,12 @@ def as_bouncing(state: State, before: State) -> State:
     return rescaled(state, state.shared.log_scale - float(gained))
 
 
+def recolored(state: State, log_factor: Tensor) -> State:
+    """``state`` with base colours times factors whose logarithms are ``log_factor`` [V, 3]."""
+    factor = torch.cat([(state.shared.gamma * log_factor).exp(), torch.ones(len(log_factor), 1)], dim=1)
+    return replace(state, operator=None, mean=state.raw * factor, table=None)
+
+
 def rescaled(state: State, log_scale: float) -> State:
     """``state`` with another scale of the albedo."""
     vector = state.shared.vector.clone()

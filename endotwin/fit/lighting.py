@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -13,7 +13,7 @@ from torch import Tensor
 from endotwin.effects import Effects
 from endotwin.effects.gain import Gain
 from endotwin.effects.offset import Offset
-from endotwin.fit.gauss_newton import HUBER, GaussNewton, State
+from endotwin.fit.gauss_newton import HUBER, GaussNewton, State, recolored
 from endotwin.fit.model import Globals, at_pixels, radiance, slope_by_log_exposure
 from endotwin.fit.normal_equations import Residual
 from endotwin.fit.within import Renewed, Varied
@@ -28,10 +28,6 @@ from endotwin.surface.vectors import unit
 
 MOST_STEP = 1.0
 """Of the logarithm of a gain: a photo all black or white tells none, and its slope is next to nothing."""
-
-
-SHARE_SAMPLES = 20_000
-"""Samples that tell how much of the light has bounced."""
 
 
 def lit(samples: Samples, surface: Surface, caster: Caster, effects: Effects) -> Samples:
@@ -102,6 +98,7 @@ class Relighting:
         self.effects = effects
         self._surface, self._caster = surface, caster
         self._bouncer = Bouncer(surface, caster, effects, views) if effects.bounce else None
+        self._asked: Asked | None = None
 
     @property
     def bounces(self) -> bool:
@@ -146,7 +143,7 @@ class Relighting:
 
     def without_bounce(self, solver: GaussNewton, state: State) -> State:
         """From here on no light bounces: the photos show none. ``state`` as if there had never been any."""
-        self._bouncer = None
+        self._bouncer = self._asked = None
         self.effects = self.effects.including(replace(self.effects["interreflection"], strength=0.0))
         solver.relight(replace(solver.samples, bounce=None))
         return replace(state, shared=state.shared.without_scale())
@@ -165,12 +162,34 @@ class Relighting:
         samples = self.bounced(samples, triangles, state)
         return exposed(samples, self.effects) if "gain" in self.effects else samples
 
-    def __call__(self, solver: GaussNewton, state: State, scaled: bool = False) -> None:
-        """Relight the samples of ``solver`` as ``state`` says, whose albedo's scale ``as_bouncing`` has left
-        as a step found it where it is ``scaled``."""
+    def asked(self, solver: GaussNewton, state: State) -> None:
+        """Hold that a step of ``solver`` has found ``state`` beside the light of its samples."""
         if self.bounces:
-            self._bouncer.settle(state, _growth(solver, state), scaled)
+            self._asked = Asked.of(solver, state)
+
+    def at_rest(self, solver: GaussNewton, state: State) -> State:
+        """``state``, found by steps of ``solver``, in colours that throw the light beside which they were
+        found: what a renderer makes of them then looks as they were fitted."""
+        if not self._has_asked(solver):
+            return state
         samples = self.relit(solver.samples, solver.triangles, state)
+        _, factor = self._asked.settled(_log_thrown(samples, state.shared))
+        vertex, count = samples.nearest(solver.triangles.numpy()), len(state.raw)
+        seen = np.bincount(vertex, minlength=count)
+        sums = np.stack([np.bincount(vertex, column, count) for column in factor.numpy().T], axis=1)
+        mean = np.where(seen[:, None] > 0, sums / np.maximum(seen, 1)[:, None], factor.numpy().mean(axis=0))
+        return recolored(state, torch.from_numpy(mean.astype(np.float32)))
+
+    def _has_asked(self, solver: GaussNewton) -> bool:
+        return self._asked is not None and self._asked.solver is solver
+
+    def __call__(self, solver: GaussNewton, state: State) -> None:
+        """Relight the samples of ``solver`` as ``state`` says."""
+        samples = self.relit(solver.samples, solver.triangles, state)
+        if self._has_asked(solver):
+            thrown = _log_thrown(samples, state.shared)
+            settled, _ = self._asked.settled(thrown)
+            samples = replace(samples, bounce=samples.bounce.brighter(settled - thrown))
         if "gain" in self.effects and state.textured:
             solver.relight(samples)
             width = HUBER * solver.noise(state)
@@ -181,6 +200,41 @@ class Relighting:
             solver.relight(samples)
 
 
+@dataclass(frozen=True)
+class Asked:
+    """The light beside which a step of ``solver`` has found materials at its N samples.
+
+    Brighter tissue throws more light, under which the photos ask for darker tissue. Each found beside the
+    last of the other, the two swing ever wider where light grows by more than the colour that throws it.
+
+    Attributes:
+        log_light: ln of indirect irradiance [N, 3]. share: of the radiance that is by it. by_color: d ln
+            irradiance / d ln albedo, all tissue about a place changing with it.
+    """
+
+    solver: GaussNewton
+    log_light: Tensor
+    share: Tensor
+    by_color: Tensor
+
+    @classmethod
+    def of(cls, solver: GaussNewton, state: State) -> Asked:
+        samples, shared = solver.samples, state.shared
+        material = at_pixels(samples, solver.triangles, state.materials)
+        whole = radiance(samples, material, shared).clamp_min(shading.RADIANCE_MIN)
+        share = (1 - radiance(replace(samples, bounce=None), material, shared) / whole).clamp(0, 1)
+        return cls(solver, _log_thrown(samples, shared), share, samples.bounce.by_scale)
+
+    def settled(self, log_thrown: Tensor) -> tuple[Tensor, Tensor]:
+        """ln of the light beside which colours that photos ask for throw it, where those found so far throw
+        ``log_thrown`` [N, 3]; and of the factor that this makes on them.
+
+        Newton's step place by place: of changes that vary faster than ``by_color`` takes them to, a part.
+        """
+        grown = (log_thrown - self.log_light) / (1 + self.share * self.by_color)
+        return self.log_light + grown, -self.share * grown
+
+
 class Bouncer:
     """Interreflection of the training views, renewed from the albedo and the light that the fit has found."""
 
@@ -189,13 +243,6 @@ class Bouncer:
         self._radiosity = Radiosity(surface, caster, effects["interreflection"].cell_mm)
         guides_mm = effects.guides_mm or AT_LENS
         self._light = BouncedLight(self._radiosity, views.T_local_camera, guides_mm, effects.profile)
-        self._level: Tensor | None = None
-
-    def settle(self, state: State, growth: Tensor, scaled: bool) -> None:
-        """Bring the mean colour that light bounces off nearer to that of ``state``, see ``settled``."""
-        target = _level(state.materials, state.shared.log_scale)
-        level = target if self._level is None else self._level
-        self._level = settled(level, target, growth, scaled)
 
     def bounced(
         self, samples: Samples, roughness: Tensor, materials: Tensor, triangles: Tensor, shared: Globals
@@ -204,8 +251,7 @@ class Bouncer:
         ``materials`` [V, 4] at the corners of ``triangles`` [F, 3]."""
         _, n, q = shared.log_light
         scale, f0 = shared.log_scale, shared.f0 * math.exp(shared.log_scale)
-        base_color = materials[:, :3] * (self._level - _level(materials, scale)).exp()
-        albedo = Albedo.of(self._radiosity, base_color, materials[:, 3], f0, triangles.numpy())
+        albedo = Albedo.of(self._radiosity, materials[:, :3], materials[:, 3], f0, triangles.numpy())
         vertex = samples.nearest(self._surface.triangles)
         places = Places(self._radiosity.to_vertex[vertex], samples.views.row(samples.frame))
         gloss = shading.specular_of_even_light(samples.cos, roughness, f0) * math.exp(-scale)
@@ -235,33 +281,6 @@ def _brightened(effects: Effects, log_gain: np.ndarray) -> Effects:
     return effects.including(Gain.centred(gain.frames, np.add(gain.log_gain, step)))
 
 
-def settled(level: Tensor, target: Tensor, growth: Tensor, scaled: bool) -> Tensor:
-    """ln of the mean albedo [3] to bounce light off next, between that of now and the ``target`` of materials
-    that were found beside the light of now.
-
-    Brighter tissue throws more light, under which the photos ask for darker tissue. Taken at once, a colour
-    whose light grows by more than itself would swing with growing strides: 1/(1 + growth) of the way is
-    Newton's step, with ``growth`` d ln x / d ln albedo of the radiance x by bounced light alone. What all
-    colours have in common is taken at once where it was found as their scale (``scaled``).
-    """
-    change = target - level
-    found = change.mean() if scaled else 0.0
-    return level + found + (change - found) / (1 + growth)
-
-
-def _growth(solver: GaussNewton, state: State) -> Tensor:
-    """d ln x / d ln albedo by bounced light alone, of the mean radiance x of the samples, [3]; 0 before any
-    has bounced."""
-    samples = solver.samples
-    if samples.bounce is None:
-        return torch.zeros(3)
-    samples = samples[torch.arange(0, len(samples), max(1, len(samples) // SHARE_SAMPLES))]
-    material = at_pixels(samples, solver.triangles, state.materials)
-    direct = radiance(replace(samples, bounce=None), material, state.shared).mean(dim=0)
-    bounced = 1 - direct / radiance(samples, material, state.shared).mean(dim=0)
-    return bounced * samples.bounce.by_scale.mean(dim=0)
-
-
-def _level(materials: Tensor, log_scale: float) -> Tensor:
-    """ln of the mean albedo of ``materials`` [V, 4], scaled, [3]."""
-    return materials[:, :3].mean(dim=0).log() + log_scale
+def _log_thrown(samples: Samples, shared: Globals) -> Tensor:
+    """ln of the indirect irradiance at N ``samples`` with L0 = 1, [N, 3]."""
+    return samples.bounce.log_irradiance(*shared.log_light[1:], shared.log_scale)

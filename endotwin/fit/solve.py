@@ -255,7 +255,7 @@ def _find_light(
             state = without_furnace(state)
             if too_dark(state):
                 state, steps = relighting.without_bounce(solver, state), number + LIGHT_STEPS
-        relighting(solver, state, scaled=True)
+        relighting(solver, state)
         within = Within.of(solver.samples, surface, unit)
         material = at_pixels(solver.samples, solver.triangles, state.materials)
         shared, noise = state.shared, solver.noise(state)
@@ -293,6 +293,7 @@ def _stepped(solver: GaussNewton, state: State, relighting: Relighting, joint: b
     stepped, gain = solver.step(state, joint)
     if joint and not gain:
         stepped, gain = solver.step(state, joint=False)
+    relighting.asked(solver, stepped)
     return as_bouncing(stepped, state) if relighting.bounces else stepped, gain
 
 
@@ -338,6 +339,7 @@ def _find_detail(
         before = pace.stopwatch.total
         relighting(solver, state)
         state, _ = solver.step(state, joint=False)
+        relighting.asked(solver, state)
         step_s = pace.stopwatch.total - before
         pace.report("find the detail", number + 1, pace.plan.steps)
     tilter = Tilter(solver, state, relighting.effects)
@@ -346,7 +348,7 @@ def _find_detail(
             break
         normals = tilter.tilted(normals)
         pace.report("tilt the normals", number + 1, pace.plan.tilts)
-    return state, normals, solver.noise(state)
+    return relighting.at_rest(solver, state), normals, solver.noise(state)
 
 
 def _light_grid(unit: float) -> HashGrid:

@@ -6,7 +6,7 @@ n and q and of how bright the tissue is.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.sparse
@@ -94,10 +94,17 @@ class Bounce(Rows):
         """The same on ``device``."""
         return Bounce(**{name: value.to(device) for name, value in vars(self).items()})
 
+    def brighter(self, log_factor: Tensor) -> Bounce:
+        """The same, brighter by factors of logarithm ``log_factor`` [N, 3]."""
+        return replace(self, log=self.log + log_factor)
+
     def irradiance(self, n: float, q: float, log_scale: float = 0.0) -> Tensor:
         """E with L0 = 1, [N, 3]."""
+        return torch.exp(self.log_irradiance(n, q, log_scale))
+
+    def log_irradiance(self, n: float, q: float, log_scale: float = 0.0) -> Tensor:
         by_light = (n * self.by_n + q * self.by_q)[:, None]
-        return torch.exp(self.log + by_light + log_scale * self.by_scale)
+        return self.log + by_light + log_scale * self.by_scale
 
 
 class BouncedLight:
