@@ -182,7 +182,7 @@ def test_a_picture_in_packets_is_that_of_single_rays(surface, camera, scale, mov
     if moved:
         caster = caster.moved(swollen(half, 0.2))
     assert caster._packets is not None
-    found = caster.cast(camera, T)
+    found = caster._picture(camera, T)
     everywhere = np.isfinite(camera.pixel_directions).all(axis=2)
     expected = caster.cast(camera, T, everywhere)
     assert 0.3 < len(found) / everywhere.sum() < 0.7

@@ -162,7 +162,7 @@ class Caster:
     ) -> Correspondences:
         """Correspondences of the view from ``T_world_camera`` [4, 4], of the pixels in ``mask`` [H, W] if
         given."""
-        if mask is None and self._packets is not None:
+        if mask is None and self._packets is not None and self._packets.native:
             return self._picture(camera, T_world_camera)
         T_local_camera = self.surface.to_local(T_world_camera).astype(np.float32)
         directions = camera.pixel_directions.reshape(-1, 3)

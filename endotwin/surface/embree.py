@@ -27,6 +27,9 @@ TRIANGLES, VERTICES = 0, 1
 UINT3, FLOAT3 = 0x5003, 0x9003
 """Of Embree 4's rtcore_buffer.h."""
 
+SIXTEEN_RAYS = 34
+"""Of Embree 4's rtcore_device.h."""
+
 FLOATS = 4
 """Of a vertex in a buffer: x, y, z and one to fill it up."""
 
@@ -40,6 +43,9 @@ FUNCTIONS = (
     ("rtcGetGeometry", c_void_p, c_uint),
     ("rtcGetGeometryBufferData", c_void_p, c_int, c_uint),
     ("rtcSetNewGeometryBuffer", c_void_p, c_int, c_uint, c_int, c_size_t, c_size_t),
+    ("rtcGetSceneDevice", c_void_p),
+    ("rtcGetDeviceProperty", c_void_p, c_int),
+    ("rtcReleaseDevice", c_void_p),
     ("rtcIntersect16", c_void_p, c_void_p, c_void_p, c_void_p),
     ("rtcOccluded16", c_void_p, c_void_p, c_void_p, c_void_p),
 )
@@ -56,6 +62,15 @@ def handle(scene: rtcore_scene.EmbreeScene, device: rtcore.EmbreeDevice) -> int 
     before, scene.is_committed = scene.is_committed, SIGN
     is_known, scene.is_committed = committed.value == SIGN and owner.value == id(device), before
     return c_void_p.from_address(id(scene) + head).value if is_known else None
+
+
+def takes_sixteen(handle: int) -> bool:
+    """Whether the processor follows sixteen rays at once in the scene of this handle."""
+    device = loaded().rtcGetSceneDevice(handle)  # retained
+    try:
+        return bool(loaded().rtcGetDeviceProperty(device, SIXTEEN_RAYS))
+    finally:
+        loaded().rtcReleaseDevice(device)
 
 
 def mesh(

@@ -1,4 +1,4 @@
-"""Rays of a picture in packets of sixteen neighbours, which Embree follows in two thirds of the time."""
+"""Rays of a picture in packets of sixteen neighbours."""
 
 from __future__ import annotations
 
@@ -45,10 +45,16 @@ class _Arguments(ctypes.Structure):
 
 
 class Packets:
-    """Follows the rays of pictures into one scene, one picture at a time."""
+    """Follows the rays of pictures into one scene, one picture at a time.
+
+    Attributes:
+        native: whether the processor follows a packet at once. Embree then takes two thirds of the time of
+            single rays; else it takes the rays of a packet one by one, and somewhat longer.
+    """
 
     def __init__(self, library: ctypes.CDLL, handle: int):
         self._library, self._handle = library, handle
+        self.native = embree.takes_sixteen(handle)
         self._arguments = _Arguments(COHERENT, FEATURES, None, None, None, 0)
 
     @classmethod
