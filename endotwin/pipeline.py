@@ -233,11 +233,12 @@ def synthesize(
         OptionError: an edit, label or layout is not understood. OutputError: ``out`` exists, or cannot be
         written.
     """
-    from endotwin.synth import render_dataset
+    from endotwin.synth import Crew, render_dataset
 
     wanted = (motion, polyps, fluids, labels, layout, limits, seed)
-    job = _job(twin, trajectory, material, light, vary, camera, effects, *wanted)
-    return render_dataset(job, out, workers, scheduler, overwrite, progress)
+    with Crew(1 if scheduler else workers) as crew:
+        job = _job(twin, trajectory, material, light, vary, camera, effects, *wanted, crew.expected)
+        return render_dataset(job, out, workers, scheduler, overwrite, progress, crew.pool)
 
 
 def with_polyps(
@@ -343,7 +344,10 @@ def _job(
     layout: str,
     limits: Limits | None,
     seed: int,
+    expected: Callable[[int], None] = lambda pixels: None,
 ) -> Job:
+    """The job of ``synthesize``'s arguments; ``expected`` is told the pixels of all frames once they are
+    known."""
     from endotwin import synth
 
     twin = as_twin(twin)
@@ -360,6 +364,7 @@ def _job(
         labels = labels if isinstance(labels, str) else ",".join(labels)
         chosen = synth.parse_labels(labels, bool(motion), grows, wet)
     poses = synth.parse_trajectory(trajectory, twin, seed, lens, limits)
+    expected(len(poses) * lens.width * lens.height)
     for added, specs in ((synth.with_polyps, polyps), (synth.with_fluids, fluids)):
         if specs:
             twin, weights = added(twin, specs, seed, poses, lens)

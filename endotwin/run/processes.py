@@ -21,7 +21,7 @@ TUNABLES, LARGE_PAGES = "GLIBC_TUNABLES", "glibc.malloc.hugetlb=1"
 
 
 class Pool(ProcessPoolExecutor):
-    """So many spawned processes, which Ctrl-C does not reach, each begun by ``begin(*arguments)``.
+    """So many spawned ``workers``, which Ctrl-C does not reach, each begun by ``begin(*arguments)``.
 
     A block that an error leaves kills them, whatever they are at. They end with this process too, even where
     that is killed. A script that makes one needs ``if __name__ == "__main__":``.
@@ -31,6 +31,7 @@ class Pool(ProcessPoolExecutor):
     """
 
     def __init__(self, workers: int, begin: Callable | None = None, *arguments: object) -> None:
+        self.workers = workers
         super().__init__(workers, multiprocessing.get_context("spawn"), _enlist, (begin, arguments))
 
     def submit(self, function: Callable, /, *arguments: object) -> Future:

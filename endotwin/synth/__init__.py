@@ -7,6 +7,7 @@ from endotwin.synth.layouts import LAYOUTS
 from endotwin.synth.motion import Motion, parse_motion
 from endotwin.synth.polyps import with_polyps
 from endotwin.synth.proof import Proof, prove
+from endotwin.synth.run.crew import Crew
 from endotwin.synth.run.dataset import Summary, make_job, render_dataset, synthesize
 from endotwin.synth.trajectories import Trajectory, parse_trajectory
 from endotwin.synth.trajectories.screening import Limits
@@ -19,6 +20,7 @@ __all__ = [
     "DEFAULT_LABELS",
     "LABELS",
     "LAYOUTS",
+    "Crew",
     "Edit",
     "Job",
     "Limits",

@@ -6,10 +6,11 @@ import logging
 import pickle
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, wait
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from functools import cache
 from pathlib import Path
 from threading import Lock
+from typing import Self
 
 import numpy as np
 import torch
@@ -17,9 +18,13 @@ from threadpoolctl import threadpool_limits
 
 from endotwin.errors import OptionError, OutputError
 from endotwin.run.processes import Pool
+from endotwin.run.threads import cores
 from endotwin.synth.job import Job
 from endotwin.synth.labels import Labeller
 from endotwin.synth.run.shard import DONE, render_shard
+
+WORTH_PROCESSES = 2e7
+"""Pixels, of all frames, below which starting processes takes longer than it saves: 65 VGA frames."""
 
 SCHEDULER_TIMEOUT_S = 15
 
@@ -33,21 +38,52 @@ def render_here(job: Job, folder: Path, shards: Iterable[int]) -> Iterator[int]:
             yield number
 
 
-def render_in_processes(job: Job, folder: Path, shards: Iterable[int], workers: int) -> Iterator[int]:
-    """Render in so many processes, each of which reads the job once; the shards' numbers as they come."""
+class Crew:
+    """Worker processes: so many, or, for 0, as many as there are cores, where it is worth it. They start, and
+    load what they need, as soon as it is ``expected`` how much there is to render, while this process still
+    prepares the job. They end with the block."""
+
+    def __init__(self, workers: int):
+        self._workers = workers
+        self._called = ExitStack()
+        self.pool: Pool | None = None
+
+    def expected(self, pixels: int) -> None:
+        """So many pixels, of all frames, are to be rendered."""
+        workers = enough(self._workers, pixels)
+        if workers > 1:
+            self.pool = self._called.enter_context(Pool(workers))
+            for _ in range(workers):
+                self.pool.submit(_keep_to_one_core)  # and so load this module
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: object) -> bool | None:
+        return self._called.__exit__(*error)
+
+
+def enough(workers: int, pixels: int) -> int:
+    """How many processes so many pixels are worth, where 0 are asked for."""
+    return workers or (cores() if pixels >= WORTH_PROCESSES else 1)
+
+
+def render_in_processes(job: Job, folder: Path, shards: Iterable[int], pool: Pool) -> Iterator[int]:
+    """Render in the processes of ``pool``, each of which reads the job once; the shards' numbers as they
+    come."""
     sent = folder / DONE / "job.pickle"
     with sent.open("wb") as file:
         pickle.dump(job, file, pickle.HIGHEST_PROTOCOL)
     left = sorted(shards)
-    with Pool(workers, _enlist, sent, folder) as pool:
+    with pool:
         tasks: dict[Future, int] = {}
 
         def hand_out(after: int | None = None) -> None:
             number = next_shard(left, after, tasks.values())
             left.remove(number)
-            tasks[pool.submit(_work, number)] = number
+            tasks[pool.submit(_work, sent, folder, number)] = number
 
-        for _ in range(min(workers, len(left))):
+        for _ in range(min(pool.workers, len(left))):
             hand_out()
         while tasks:
             for task in wait(tasks, return_when=FIRST_COMPLETED).done:
@@ -128,21 +164,17 @@ def _silent(library: str) -> Iterator[None]:
 
 # In the worker
 
-_bench: tuple[Job, Labeller, Path] | None = None
+_bench: tuple[Job, Labeller] | None = None
 _building = Lock()
 
 
-def _enlist(sent: Path, folder: Path) -> None:
-    """Make this process a worker for the job in the file ``sent``."""
+def _work(sent: Path, folder: Path, number: int) -> None:
+    """Render a shard of the job in the file ``sent``, the only one of this process."""
     global _bench
-    _keep_to_one_core()
-    job = pickle.loads(sent.read_bytes())
-    _bench = (job, Labeller(job), folder)
-
-
-def _work(number: int) -> None:
-    job, labeller, folder = _bench
-    render_shard(job, labeller, folder, number)
+    if _bench is None:
+        job = pickle.loads(sent.read_bytes())
+        _bench = (job, Labeller(job))
+    render_shard(*_bench, folder, number)
 
 
 def _work_for(job: Job, folder: Path, number: int) -> int:
@@ -151,7 +183,7 @@ def _work_for(job: Job, folder: Path, number: int) -> int:
     with _building:
         if _bench is None or _bench[0] is not job:
             _keep_to_one_core()
-            _bench = (job, Labeller(job), folder)
+            _bench = (job, Labeller(job))
         labeller = _bench[1]
     render_shard(job, labeller, folder, number)
     return number

@@ -16,7 +16,7 @@ from endotwin.cameras import Camera
 from endotwin.effects.video import CLIP_FRAMES, Video
 from endotwin.errors import EndotwinError, OptionError, OutputError, TwinError
 from endotwin.run.output import DATASET, check_apart, unwritable
-from endotwin.run.threads import cores
+from endotwin.run.processes import Pool
 from endotwin.synth.encodings import FLOW_RANGE_PX
 from endotwin.synth.job import Job
 from endotwin.synth.labels import DEFAULT_LABELS, LABELS, OF_MOTION
@@ -33,9 +33,6 @@ from endotwin.synth.run.shard import done_shards, frame_record, total
 from endotwin.synth.trajectories import Trajectory
 from endotwin.synth.variation import Variation
 from endotwin.twin import Twin
-
-WORTH_PROCESSES = 2e7
-"""Pixels, of all frames, below which starting processes takes longer than it saves: 65 VGA frames."""
 
 PROOF_PAIRS = 2
 """Pairs of frames whose labels are compared for the datasheet; ``endotwin check --labels`` takes more."""
@@ -116,14 +113,15 @@ def render_dataset(
     scheduler: str | None = None,
     overwrite: bool = False,
     progress: Callable[[str, int, int], None] | None = None,
+    pool: Pool | None = None,
 ) -> Summary:
-    """Do a job; arguments and errors are those of ``synthesize``."""
+    """Do a job; arguments and errors are those of ``synthesize``. ``pool``: of processes that are there."""
     check_apart(Path(out), [job.twin.source.path])
     partial = Partial(Path(out))
     with partial.claimed(job.digest(), overwrite) as finished:
         if not finished:
             with _resumable(partial):
-                _render(job, partial, workers, scheduler, progress)
+                _render(job, partial, workers, scheduler, progress, pool)
                 _finish(job, partial)
     return _summary(Path(out))
 
@@ -180,6 +178,7 @@ def _render(
     workers: int,
     scheduler: str | None,
     progress: Callable[[str, int, int], None] | None,
+    pool: Pool | None,
 ) -> None:
     """Render the shards that are not done yet."""
     done = done_shards(partial.path)
@@ -189,14 +188,12 @@ def _render(
         progress("render", frames, len(job))
     if not pending:
         return
-    if workers == 0:
-        pixels = (len(job) - frames) * job.camera.width * job.camera.height
-        workers = cores() if pixels >= WORTH_PROCESSES else 1
+    workers = crew.enough(workers, (len(job) - frames) * job.camera.width * job.camera.height)
     workers = min(workers, len(pending))
     if scheduler:
         rendered = crew.render_on_cluster(job, partial.path, pending, scheduler)
     elif workers > 1:
-        rendered = crew.render_in_processes(job, partial.path, pending, workers)
+        rendered = crew.render_in_processes(job, partial.path, pending, pool or Pool(workers))
     else:
         rendered = crew.render_here(job, partial.path, pending)
     for number in rendered:
