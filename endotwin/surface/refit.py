@@ -17,8 +17,7 @@ DYNAMIC, ROBUST = 1, 4
 
 
 class Refit:
-    """The tree of a scene with one mesh. It is built once, of the mesh as it is then, by Morton codes: in a
-    quarter of the time of the usual one, and rays are as fast in it."""
+    """The tree of a scene with one mesh. It is built once, of the mesh as it is then."""
 
     def __init__(self, library: ctypes.CDLL, scene: rtcore_scene.EmbreeScene, handle: int, vertices: int):
         self._library, self._scene, self._handle = library, scene, c_void_p(handle)
@@ -27,8 +26,6 @@ class Refit:
         self._vertices_mm = embree.buffer(start, vertices, embree.FLOATS, np.float32)[:, :3]
         library.rtcSetSceneFlags(self._handle, DYNAMIC | ROBUST)
         library.rtcSetSceneBuildQuality(self._handle, LOW)
-        library.rtcSetGeometryBuildQuality(self._geometry, LOW)
-        self._commit()
         library.rtcSetGeometryBuildQuality(self._geometry, REFIT)
         self._commit()
 
