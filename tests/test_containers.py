@@ -7,11 +7,12 @@ from io import BytesIO
 
 import cv2
 import numpy as np
+import OpenEXR
 import pytest
 import tifffile
 from PIL import Image
 
-from endotwin.synth.containers import deflated_tiff, pixels, png, tiff
+from endotwin.synth.containers import deflated_tiff, exr, pixels, png, tiff
 
 SHAPES = ((7, 5), (7, 5, 3), (1, 1), (480, 640, 3))
 
@@ -53,3 +54,14 @@ def test_tiff_holds_the_image_for_tifffile_and_opencv(shape, dtype, write):
     else:
         found = cv2.imdecode(np.frombuffer(write(image), np.uint8), cv2.IMREAD_UNCHANGED)
         np.testing.assert_array_equal(found if image.ndim == 2 else found[..., ::-1], image)
+
+
+@pytest.mark.parametrize("names", ["Z", "YX", "XYZ"])
+@pytest.mark.parametrize("shape", [(7, 5), (1, 1), (480, 640)])
+def test_exr_of_floats_is_what_the_library_writes(shape, names):
+    planes = np.random.default_rng(0).normal(size=(len(names), *shape)).astype(np.float32)
+    planes[0, 0, 0] = np.nan
+    channels, file = dict(zip(names, planes, strict=True)), BytesIO()
+    header = {"compression": OpenEXR.NO_COMPRESSION, "type": OpenEXR.scanlineimage}
+    OpenEXR.File(header, dict(channels), num_threads=0).write(file)
+    assert exr(**channels) == file.getvalue()

@@ -9,6 +9,7 @@ compression for an eighth less (scene flow 50 ms and 3.22 MB, 5 ms and 3.69 MB),
 from __future__ import annotations
 
 import struct
+from functools import cache
 from io import BytesIO
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -26,6 +27,9 @@ SIGNATURE = b"\x89PNG\r\n\x1a\n"
 GREY, RGB = 0, 2
 UP = 2
 """PNG's codes of colour, and of a row that is written as its difference from the one above."""
+
+LINE_HEAD = 8
+"""Bytes of an OpenEXR file before the values of each line: which it is, and how many bytes follow."""
 
 
 def png(image: np.ndarray) -> bytes:
@@ -83,10 +87,29 @@ def pixels(content: bytes) -> np.ndarray:
 
 def exr(**channels: np.ndarray) -> bytes:
     """An OpenEXR file of float16 or float32 channels, [H, W] or, as ``RGB``, [H, W, 3]."""
-    halves = all(values.dtype == np.float16 for values in channels.values())
-    compression = OpenEXR.RLE_COMPRESSION if halves else OpenEXR.NO_COMPRESSION
-    header = {"compression": compression, "type": OpenEXR.scanlineimage}
+    if all(values.dtype == np.float16 for values in channels.values()):
+        return _exr(channels, OpenEXR.RLE_COMPRESSION)
+    names = sorted(channels)
+    height, width = channels[names[0]].shape
+    content = bytearray(_empty_exr(height, width, *names))
+    row = LINE_HEAD + 4 * width * len(names)
+    lines = np.frombuffer(content, np.uint8)[len(content) - height * row :].reshape(height, row)
+    values = lines[:, LINE_HEAD:].view("<f4").reshape(height, len(names), width)
+    for k, name in enumerate(names):
+        values[:, k] = channels[name]
+    return bytes(content)
+
+
+@cache
+def _empty_exr(height: int, width: int, *names: str) -> bytes:
+    """An OpenEXR file of float32 channels that are 0, not compressed: it ends with the image's lines, all
+    channels of each in the order of their names. To fill this in takes a quarter of the library's time."""
+    return _exr({name: np.zeros((height, width), np.float32) for name in names}, OpenEXR.NO_COMPRESSION)
+
+
+def _exr(channels: dict[str, np.ndarray], compression: OpenEXR.Compression) -> bytes:
     file = BytesIO()
+    header = {"compression": compression, "type": OpenEXR.scanlineimage}
     OpenEXR.File(header, channels, num_threads=0).write(file)
     return file.getvalue()
 
