@@ -142,6 +142,7 @@ class Renderer:
 
     def moved(self, caster: Caster) -> Renderer:
         """The renderer of the same twin on the moved surface of ``caster``, which has the same triangles."""
+        _ = self._sees, self._transmission  # found once for all that this one becomes
         other = copy(self)
         rest, surface, materials = self.twin.surface, caster.surface, self.twin.materials
         if materials.film is not None:
