@@ -363,7 +363,8 @@ def _close_slits(radiance: np.ndarray, told: np.ndarray, edges: np.ndarray) -> N
 def bent(shown: np.ndarray) -> np.ndarray:
     """Bool [H, W]: pixels whose mean is not the value of their centre, by the curvature of ``shown`` [H, W,
     3], in display values: a 24th of the Laplacian, for a parabola."""
-    return np.abs(cv2.Laplacian(shown.mean(axis=2), -1)) > 24 * BENT
+    mean = (shown[..., 0] + shown[..., 1] + shown[..., 2]) / np.float32(3)
+    return np.abs(cv2.Laplacian(mean, -1)) > 24 * BENT
 
 
 def shadow_edges(visible: np.ndarray) -> np.ndarray:

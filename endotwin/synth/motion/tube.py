@@ -8,6 +8,7 @@ f > 0 and the line bends less than the wall is away, so the tissue neither tears
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Self
 
 import numpy as np
@@ -64,6 +65,11 @@ class Line:
         sideways = unit(sideways - chord * (chord @ sideways))
         tangents = unit(np.gradient(points, axis=0))
         return cls(even - reach_mm, points, tangents, radius_mm, sideways, centerline.length_mm)
+
+    @cached_property
+    def tree(self) -> cKDTree:
+        """Of its points."""
+        return cKDTree(self.points)
 
     def bent(self, contraction_mm: np.ndarray, shift_mm: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The shift u [S, 3] and the matrix M [S, 3, 3] of each place, of a contraction and a shift [S]."""
@@ -169,7 +175,7 @@ def _turn(one: np.ndarray, other: np.ndarray) -> np.ndarray:
 
 def nearest(line: Line, points: np.ndarray) -> np.ndarray:
     """Way along the line, mm, to its place nearest to each of ``points`` [N, 3], [N]."""
-    station = cKDTree(line.points).query(points)[1]
+    station = line.tree.query(points)[1]
     ahead = dot(points - line.points[station], line.tangents[station])
     return line.s_mm[station] + np.clip(ahead, -SPACING_MM, SPACING_MM)
 
