@@ -77,8 +77,9 @@ class Sight:
         u, v = uv.T
         distance_mm = np.sqrt(dot(towards, towards))
         seen, known = self._at_a_glance(u, v, distance_mm)
-        inside = (u > -0.5) & (u < width - 0.5) & (v > -0.5) & (v < height - 0.5)
-        asked = np.flatnonzero(inside & ~known)
+        asked = np.flatnonzero(~known)
+        u, v = u[asked], v[asked]
+        asked = asked[(u > -0.5) & (u < width - 0.5) & (v > -0.5) & (v < height - 0.5)]
         distance_mm = distance_mm[asked].astype(np.float64)
         rays = (towards[asked] / np.maximum(distance_mm, 1e-9)[:, None]).astype(np.float32)
         centre = (self.T_world_camera[:3, 3] - self.surface.origin_mm).astype(np.float32)
