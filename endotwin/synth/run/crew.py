@@ -172,6 +172,7 @@ def _work(sent: Path, folder: Path, number: int) -> None:
     """Render a shard of the job in the file ``sent``, the only one of this process."""
     global _bench
     if _bench is None:
+        _keep_to_one_core()
         job = pickle.loads(sent.read_bytes())
         _bench = (job, Labeller(job))
     render_shard(*_bench, folder, number)
