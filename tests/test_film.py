@@ -203,6 +203,20 @@ def test_vertices_in_shadow_dim_or_dazzling_light_leave_no_nan(strength):
     assert strength or not len(film)
 
 
+def test_a_ray_through_a_vertex_says_nothing_of_the_other_corners():
+    """Their shares are 0 in all pixels, and what they show would be 0/0."""
+    twin = tube(Effects([Specular()]))
+    samples = tube_twin.photographed(twin, twin.camera, POSES[:3])
+    corner = torch.zeros_like(samples.barycentric)
+    corner[:, 0] = 1.0
+    samples = replace(samples, barycentric=corner)
+    relighting = Relighting(twin.surface, Caster(twin.surface), twin.effects, samples.views)
+    model = Model(twin, tube_twin.state_of(twin), relighting, relighting._caster)
+    vertex = np.unique(twin.surface.triangles[samples.triangle.numpy()])
+    glints = _Glints.of(model.based(samples), vertex)
+    assert len(glints.shown) and glints.shown.isfinite().all() and glints.radiance.isfinite().all()
+
+
 def made_up(strength: float, shown: torch.Tensor) -> _Glints:
     """One vertex in three photos, of ``shown`` [3, 3], a tenth of a degree from each other."""
     half = unit(np.array([[[0, 0.002 * k, 1.0]] for k in range(3)], np.float32))

@@ -59,6 +59,9 @@ JUDGES, MOST = 1_000_000, 1_500_000
 NEARNESS = 2
 """Pixels count by this power of the share that a vertex has in them."""
 
+LEAST_SHARE = 1e-3
+"""A pixel says nothing of a vertex that has less of it: a ray through another has none."""
+
 PEAK, PEAK_SPREAD, GLINT_ERROR = 2.0, 3.0, 0.1
 """Prior of a vertex's peak radiance (its median, and the standard deviation of its logarithm), beside the
 error of a glint's display values."""
@@ -340,16 +343,19 @@ def _damped(normal: Tensor, pull: Tensor, damping: Tensor) -> Tensor:
 
 
 def _pairs(based: Based, vertex: np.ndarray) -> tuple[csr_array, np.ndarray, np.ndarray]:
-    """Shares float32 [N, P] in each sample of the pairs of a photo and one of ``vertex``; the photo's row
-    among the views, and the place in ``vertex``, of each pair, ascending, both [P]."""
+    """Shares float32 [N, P] in each sample of the pairs of a photo and one of ``vertex``, none less than
+    LEAST_SHARE; the photo's row among the views, and the place in ``vertex``, of each pair, ascending, both
+    [P].
+    """
     surface, samples = based.model.twin.surface, based.samples
     place = np.full(len(surface.vertices_mm), -1)
     place[vertex] = np.arange(len(vertex))
     corners = place[surface.triangles[samples.triangle.numpy()]]
-    sample, corner = np.nonzero(corners >= 0)
+    share = samples.barycentric.numpy()
+    sample, corner = np.nonzero((corners >= 0) & (share >= LEAST_SHARE))
     row = samples.views.row(samples.frame)[sample]
     pair, which = np.unique(row * len(vertex) + corners[sample, corner], return_inverse=True)
-    share = samples.barycentric.numpy()[sample, corner]
+    share = share[sample, corner]
     mix = csr_array((share, (sample, which.reshape(-1))), (len(samples), len(pair)))
     return mix, pair // len(vertex), pair % len(vertex)
 
