@@ -27,7 +27,7 @@ from endotwin.effects.specular import Specular
 from endotwin.effects.vignetting import Vignetting
 from endotwin.evidence.bounce import bounced, cell_mm
 from endotwin.evidence.glints import Glints
-from endotwin.evidence.guide_search import Guides, Search, found_guides
+from endotwin.evidence.guide_search import Guides, found_guides, settled
 from endotwin.evidence.log_light import Bounced
 from endotwin.evidence.probe import MIN_IMPOSSIBLE_DB, Fitted, Hypothesis, Probe, Verdict
 from endotwin.light.guides import AT_LENS, COSINE, EXPONENTIAL
@@ -176,10 +176,7 @@ class _Trial:
         return other if on else kept
 
     def _settled(self, model: Fitted) -> Fitted:
-        """With its guides where they predict best beside all its effects, if that is elsewhere."""
-        guides_mm = Search.of(self._probe, model.hypothesis, self._glints()).settled()
-        moved = self._probe.fit(replace(model.hypothesis, guides_mm=guides_mm))
-        return moved if self._probe.compare(model, moved).gain_db > 0 else model
+        return settled(self._probe, model, self._glints())
 
     def decided(self, kept: Fitted) -> Decided:
         """The effects of ``kept``, each with the evidence for it or against it."""

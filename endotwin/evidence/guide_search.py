@@ -9,7 +9,7 @@ import numpy as np
 from scipy.optimize import least_squares, minimize
 
 from endotwin.evidence.glints import Glints
-from endotwin.evidence.probe import Hypothesis, Probe
+from endotwin.evidence.probe import Fitted, Hypothesis, Probe
 from endotwin.light.guides import AT_LENS
 
 Guides = tuple[tuple[float, float, float], ...]
@@ -48,8 +48,9 @@ def found_guides(probe: Probe, base: Hypothesis, glints: Glints, forced: bool) -
     """Positions of one to three guides that predict held-out pixels better than ``base``, camera frame; the
     lens where none do. They are sought where they explain the ``glints`` as well.
 
-    One guide, and a glance at two and three, tell whether a search is worth its time. With ``forced`` there
-    is always a position: that of the most guides, if none is worth it.
+    One guide, and a glance at two and three, tell whether a search is worth its time. Two in the plane of the
+    lens pass for one behind it: before another is believed those before it go to where they are best. With
+    ``forced`` there is always a position: that of the most guides, if none is worth it.
     """
     search = Search.of(probe, base, glints)
     if not forced and not search.hints():
@@ -58,10 +59,20 @@ def found_guides(probe: Probe, base: Hypothesis, glints: Glints, forced: bool) -
     for number in range(1, MOST_GUIDES + 1):
         guides_mm = search.best(guides_mm)
         found = probe.fit(replace(base, guides_mm=guides_mm, shadows=True))
-        last = forced and best is None and number == MOST_GUIDES
-        if last or probe.compare(best or plain, found).keep:
+        worth = probe.compare(best or plain, found).keep
+        if worth and best is not None:
+            best = settled(probe, best, glints)
+            worth = probe.compare(best, found).keep
+        if worth or (forced and best is None and number == MOST_GUIDES):
             best = found
     return AT_LENS if best is None else Search.of(probe, best.hypothesis, glints).polished()
+
+
+def settled(probe: Probe, model: Fitted, glints: Glints) -> Fitted:
+    """``model`` with its guides where they predict best beside all its effects, if that is elsewhere."""
+    guides_mm = Search.of(probe, model.hypothesis, glints).settled()
+    moved = probe.fit(replace(model.hypothesis, guides_mm=guides_mm))
+    return moved if probe.compare(model, moved).gain_db > 0 else model
 
 
 class Search:
