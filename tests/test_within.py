@@ -85,18 +85,29 @@ def test_tissue_without_a_coat_gets_none_and_one_that_is_forced_on_weighs_nothin
     assert decision.state == "on" and forced.weight < 0.02
 
 
-def test_roughness_that_is_off_everywhere_is_found_with_f0_and_is_no_coat():
-    within, material = photographed()
-    shared, logit = TRUE, torch.tensor(roughness_to_raw(0.55))
+def at_roughness(material: torch.Tensor, logit: torch.Tensor | float) -> torch.Tensor:
     low, high = ROUGHNESS_RANGE
-    material[:, 3] = low + (high - low) * torch.sigmoid(logit)
-    assert judged(within.highlights(material, shared, NOISE), "auto")[0] is None
-    for _ in range(6):
-        found = within.shone(material, shared, NOISE)
+    material[:, 3] = low + (high - low) * torch.sigmoid(torch.as_tensor(logit))
+    return material
+
+
+def test_roughness_that_is_off_everywhere_is_no_coat():
+    within, material = photographed()
+    material = at_roughness(material, roughness_to_raw(0.55))
+    assert judged(within.highlights(material, TRUE, NOISE), "auto")[0] is None
+
+
+def test_roughness_f0_and_a_coat_are_told_from_each_other():
+    """The roughness of all tissue is off, and at first the coat makes up for it."""
+    true = replace(TRUE, coat=Coat(0.8, 0.09))
+    within, material = photographed(true)
+    shared, logit = replace(TRUE, coat=Coat(0.4, 0.09)), roughness_to_raw(0.55)
+    for _ in range(10):
+        found = within.shone(at_roughness(material, logit), shared, NOISE)
         shared, logit = found.shared, logit + found.roughness
-        material[:, 3] = low + (high - low) * torch.sigmoid(logit)
-    assert float(material[0, 3]) == pytest.approx(ROUGHNESS, rel=0.01)
-    assert told(shared) == pytest.approx(told(TRUE), rel=0.01)
+    assert float(at_roughness(material, logit)[0, 3]) == pytest.approx(ROUGHNESS, rel=0.02)
+    assert shared.coat.weight == pytest.approx(0.8, rel=0.03)
+    assert told(shared) == pytest.approx(told(TRUE), rel=0.02)
 
 
 def test_gains_that_follow_the_distance_are_told_from_the_falloff():

@@ -20,6 +20,7 @@ import numpy as np
 from endotwin.effects import Decision, Effect, Effects
 from endotwin.effects.gain import Gain
 from endotwin.effects.interreflection import Interreflection
+from endotwin.effects.noise import LEVEL
 from endotwin.effects.offset import Offset
 from endotwin.effects.profile import Profile
 from endotwin.effects.shadows import Shadows
@@ -43,6 +44,9 @@ LEAST_GAIN, PLAIN_DB = 0.08, 3.0
 """Standard deviation of ln gain below which, beside bounced light, it is none, unless it leaves half of the
 loss: the bounce from a mesh of what was seen errs by some 4 % of a frame's brightness. An automatic gain
 changes it by tens."""
+
+SHOWN_GAIN = LEVEL / PRIOR["gamma"]
+"""Standard deviation of ln gain that changes white by one of 255 levels: a smaller one no photo shows."""
 
 LEAST = {"interreflection": Verdict(0.1, 3.0), "vignetting": Verdict(0.05, 3.0)}
 """What an effect has to gain where the usual is too much: bounced light has no coefficient of its own, and
@@ -88,7 +92,7 @@ def decide(
     kept = trial.shadowed(kept)
     for name in BESIDE:
         kept = trial.beside(name, kept)
-    return trial.decided(kept)
+    return trial.decided(trial.without_idle_gain(kept))
 
 
 class _Trial:
@@ -174,6 +178,15 @@ class _Trial:
         self._say(name, on, verdict)
         self._seconds[name] += time.perf_counter() - began
         return other if on else kept
+
+    def without_idle_gain(self, kept: Fitted) -> Fitted:
+        """``kept``, or the same without a gain that had stood for what was found beside it since."""
+        idle = kept.hypothesis.gain and float(kept.log_gain.std()) < SHOWN_GAIN
+        if not idle or self.wanted("gain") == "on":
+            return kept
+        without = self._probe.fit(replace(kept.hypothesis, gain=False))
+        self._say("gain", False, self._probe.compare(without, kept))
+        return without
 
     def _settled(self, model: Fitted) -> Fitted:
         return settled(self._probe, model, self._glints())

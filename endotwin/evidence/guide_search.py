@@ -49,7 +49,7 @@ def found_guides(probe: Probe, base: Hypothesis, glints: Glints, forced: bool) -
     lens where none do. They are sought where they explain the ``glints`` as well.
 
     One guide, and a glance at two and three, tell whether a search is worth its time. Two in the plane of the
-    lens pass for one behind it: before another is believed those before it go to where they are best. With
+    lens pass for one behind it: another is believed only beside those before it where they are best. With
     ``forced`` there is always a position: that of the most guides, if none is worth it.
     """
     search = Search.of(probe, base, glints)
@@ -61,8 +61,7 @@ def found_guides(probe: Probe, base: Hypothesis, glints: Glints, forced: bool) -
         found = probe.fit(replace(base, guides_mm=guides_mm, shadows=True))
         worth = probe.compare(best or plain, found).keep
         if worth and best is not None:
-            best = settled(probe, best, glints)
-            worth = probe.compare(best, found).keep
+            worth = probe.compare(settled(probe, best, glints), found).keep
         if worth or (forced and best is None and number == MOST_GUIDES):
             best = found
     return AT_LENS if best is None else Search.of(probe, best.hypothesis, glints).polished()

@@ -37,7 +37,7 @@ from endotwin.fit.model import Globals, at_pixels
 from endotwin.fit.sparkle import sparkle
 from endotwin.fit.tilt import Tilter
 from endotwin.fit.unexplained import residual_warning
-from endotwin.fit.within import Within
+from endotwin.fit.within import Renewed, Within
 from endotwin.light.film import Film
 from endotwin.light.shading import F0_DIELECTRIC, ROUGHNESS_TISSUE
 from endotwin.pixels.length_unit import unit_mm
@@ -268,7 +268,7 @@ def _find_light(
             shared = replace(shared, coat=layer)
         if relighting.bounces:
             solver.held = (*start.undetermined, "L0", *(("albedo scale",) * (number < HOLD_STEPS)))
-            found = within.shone(material, shared, noise)
+            found = within.shone(material, shared, noise) if shared.coat else Renewed(shared)
         else:
             found = within.renewed(material, shared, start.undetermined, noise, relighting.varied)
             relighting.vary(solver, found)

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import scipy.linalg
@@ -84,8 +84,8 @@ class Renewed:
     the guides' places, float64 [guides, 3], mm, and to the logit of all roughness."""
 
     shared: Globals
-    log_gain: np.ndarray
-    aside_mm: np.ndarray
+    log_gain: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    aside_mm: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
     roughness: float = 0.0
 
 
@@ -145,7 +145,11 @@ class Within:
         return replace(found, shared=shone.shared, roughness=shone.roughness)
 
     def shone(self, material: Tensor, shared: Globals, noise: float) -> Renewed:
-        """A step of f0, roughness and the coat, which pass for one another, together."""
+        """A step of f0 and, where there is a coat, of it and of roughness, which pass for one another.
+
+        Without a coat roughness is left to the materials: diffuse light depends on it as well, and it would
+        take up what other faults of the model leave.
+        """
         kept = ("level", "n", "q", "gamma", *(("albedo scale",) * shared.bounces))
         return self._step(material, shared, kept, torch.ones(len(self.samples), dtype=torch.bool), noise)
 
@@ -179,26 +183,27 @@ class Within:
         if not free.shape[1] or len(seen.residual) < LEAST_SIGHTINGS:
             return Renewed(shared, np.zeros(varied.frames), np.zeros((varied.guides, 3)))
         frame = np.searchsorted(self.samples.views.frames, seen.frame) if varied.frames else None
-        columns, prior = self._columns(seen, shared, free, shiny="f0" not in held)
+        coated = "f0" not in held and shared.coat is not None
+        columns, prior = self._columns(seen, shared, free, coated)
         design = Design(columns, seen.vertex, self.count, frame, seen.weight, prior)
         found = regress(seen.residual, design, varied.frames, rounds=REWEIGHTS)
         count, guides = free.shape[1], seen.by_guides.shape[1]
         along, places, shine = np.split(found.coefficients, [count, count + guides])
-        along, rougher = free @ along, shine[:1].sum()
+        along, (rougher, wetter) = free @ along, shine if coated else (0.0, 0.0)
         spread = np.r_[global_prior(self.unit_mm, len(shared.vector))[1].numpy(), ROUGHNESS_LOGIT_SPREAD]
         length = min(1.0, float((spread / np.maximum(np.abs(np.r_[along, rougher]), 1e-12)).min()))
-        if len(shine) > 1:
-            weight = max(0.0, shared.coat.weight + length * float(shine[1]))
+        if coated:
+            weight = max(0.0, shared.coat.weight + length * float(wetter))
             shared = replace(shared, coat=replace(shared.coat, weight=weight))
         log_gain = found.intercepts / shared.gamma if varied.frames else np.zeros(0)
         moved = bounded(shared, shared.vector + torch.from_numpy(length * along))
         return Renewed(moved, length * log_gain, length * places.reshape(-1, 3), length * float(rougher))
 
     def _columns(
-        self, seen: Sightings, shared: Globals, free: np.ndarray, shiny: bool
+        self, seen: Sightings, shared: Globals, free: np.ndarray, coated: bool
     ) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]:
-        """Columns of the ``free`` directions, of the guides' places and, of what is ``shiny``, of roughness
-        and of a coat; and what is known of their coefficients."""
+        """Columns of the ``free`` directions, of the guides' places and, under a coat that is sought, of
+        roughness and its weight; and what is known of their coefficients."""
         mean, spread = (x.numpy() for x in global_prior(self.unit_mm, len(shared.vector)))
         guides = seen.by_guides.shape[1]
         parts = [
@@ -207,14 +212,10 @@ class Within:
         ]
         pulls = [free.T @ (TEMPER * (mean - shared.vector.numpy()) / spread**2), np.zeros(guides)]
         columns = [seen.slopes @ free, seen.by_guides]
-        if shiny:
-            columns.append(seen.by_roughness[:, None])
-            parts.append(TEMPER / ROUGHNESS_LOGIT_SPREAD**2)
-            pulls.append([0.0])
-        if shiny and shared.coat is not None:
-            columns.append(seen.by_coat[:, None])
-            parts.append(TEMPER / COAT_SPREAD**2)
-            pulls.append([-TEMPER * shared.coat.weight / COAT_SPREAD**2])
+        if coated:
+            columns.append(np.c_[seen.by_roughness, seen.by_coat])
+            parts.append(TEMPER * np.diag([1 / ROUGHNESS_LOGIT_SPREAD**2, 1 / COAT_SPREAD**2]))
+            pulls.append([0.0, -TEMPER * shared.coat.weight / COAT_SPREAD**2])
         return np.hstack(columns), (scipy.linalg.block_diag(*parts), np.concatenate(pulls))
 
     @property
