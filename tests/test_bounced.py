@@ -6,15 +6,16 @@ import torch
 import trimesh
 
 from endotwin.fusion.mesh import surface_of
-from endotwin.light.bounced import Albedo, BouncedLight, Places
+from endotwin.light.bounced import GAMMA_STEP, Albedo, BouncedLight, Places
+from endotwin.light.forward import Lobes
 from endotwin.light.guides import AT_LENS, COSINE
 from endotwin.light.radiosity import BOUNCES, Radiosity
-from endotwin.light.shading import specular_albedo
 from endotwin.surface.casting import Caster
 
 RADIUS_MM = 10.0
-BASE_COLOR, ROUGHNESS, F0 = 0.5, 0.4, 0.04
-GLOSSY = float(specular_albedo(torch.tensor(ROUGHNESS), F0))
+BASE_COLOR, ROUGHNESS = 0.5, 0.4
+WET = Lobes(0.04, coat=(0.8, 0.12, 2.0))
+GLOSSY = float(WET.glossy_albedo(torch.tensor(ROUGHNESS)))
 
 
 @pytest.fixture(scope="module")
@@ -25,7 +26,7 @@ def sphere() -> tuple[BouncedLight, Places, Albedo]:
     radiosity = Radiosity(surface, Caster(surface), cell_mm=3.0)
     count = len(surface.vertices_mm)
     color, roughness = torch.full((count, 3), BASE_COLOR), torch.full((count,), ROUGHNESS)
-    albedo = Albedo.of(radiosity, color, roughness, F0, surface.triangles)
+    albedo = Albedo.of(radiosity, color, roughness, WET, surface.triangles)
     light = BouncedLight(radiosity, np.tile(np.eye(4), (2, 1, 1)), AT_LENS, COSINE)
     return light, Places(radiosity.to_vertex, np.arange(count) % 2), albedo
 
@@ -60,3 +61,18 @@ def test_the_expansion_is_exact_where_it_was_made_and_follows_the_light(sphere):
     np.testing.assert_allclose(bounce.by_q, -np.log(RADIUS_MM), rtol=0.01)
     moved = light.at(places, 0.55, 1.95, albedo.scaled(0.15))
     np.testing.assert_allclose(bounce.irradiance(0.55, 1.95, 0.15), moved, rtol=0.01)
+
+
+def test_the_expansion_follows_the_response_through_which_photos_tell_the_albedo(sphere):
+    """The same photos tell of brighter tissue where γ is larger."""
+    light, places, albedo = sphere
+    gamma, gloss = 0.45, torch.zeros(len(places.view))
+
+    def told(other: float) -> Albedo:
+        return Albedo(albedo.base_color ** (gamma / other), albedo.glossy)
+
+    bounce = light.expanded(places, 0.5, 2.0, albedo, gloss, seen_by=(gamma, told(gamma + GAMMA_STEP)))
+    for other in (gamma, gamma + GAMMA_STEP):
+        there = light.at(places, 0.5, 2.0, told(other).scaled(0.0))
+        np.testing.assert_allclose(bounce.irradiance(0.5, 2.0, gamma=other), there, rtol=1e-4)
+    assert (bounce.by_gamma > 0.5).all()

@@ -74,7 +74,11 @@ def test_the_derivatives_of_least_squares_are_those_of_automatic_differentiation
             torch.exp(vector[4]), coat=None if coat is None else (weight, coat.roughness, coat.tail)
         )
         color = shown ** (1 / vector[3])
-        x = forward.radiance(samples.lit(n, q, scale), (log_L0, n, q), color, roughness, lobes)
+        lit = samples.lit(n, q, scale, vector[3])
+        if samples.bounce is not None and samples.bounce.shown is not None:
+            followed = samples.bounce.followed(torch.log(color), vector[3])
+            lit = replace(lit, irradiance=lit.irradiance * followed)
+        x = forward.radiance(lit, (log_L0, n, q), color, roughness, lobes)
         return shading.respond(x, vector[3])
 
     weight = torch.tensor(0.0 if coat is None else coat.weight, dtype=torch.float64)

@@ -9,6 +9,7 @@ from independent.gloss import Gloss
 from independent.light import Lamp, burley, dot, ggx
 
 from endotwin.light import shading
+from endotwin.light.forward import Lobes
 from endotwin.light.guides import AT_LENS, COSINE, EXPONENTIAL, guided
 from endotwin.surface.vectors import unit
 
@@ -54,3 +55,19 @@ def test_even_surroundings_shine_as_the_lobes_integral_says() -> None:
     cos, roughness = (grid.ravel() for grid in np.meshgrid(np.linspace(0.5, 1, 9), np.linspace(0.25, 0.8, 9)))
     fit = shading.specular_of_even_light(torch.from_numpy(cos), torch.from_numpy(roughness), 0.04).numpy()
     np.testing.assert_allclose(fit, Gloss(0.04).at(cos, roughness), atol=0.01)
+
+
+def test_a_coat_reflects_even_surroundings_as_a_film_of_water_does() -> None:
+    cos, roughness = np.linspace(0.5, 1, 9), np.full(9, 0.4)
+    bare, wet = (Lobes(0.04, coat=coat) for coat in (None, (0.7, 0.3, 2.0)))
+    arguments = torch.from_numpy(cos), torch.from_numpy(roughness)
+    more = (wet.gloss(*arguments) - bare.gloss(*arguments)).numpy()
+    np.testing.assert_allclose(more, 0.7 * Gloss(0.02).at(cos, np.full(9, 0.3)), atol=0.007)
+    assert not Lobes(0.0).gloss(*arguments).any()
+
+
+def test_all_that_white_lobes_send_back_is_the_mean_over_directions() -> None:
+    roughness, lobes = np.array([0.3, 0.5, 0.7]), Lobes(0.04, coat=(0.5, 0.3, 2.0))
+    expected = Gloss(0.04).mean(roughness) + 0.5 * Gloss(0.02).mean(np.full(3, 0.3))
+    found = lobes.glossy_albedo(torch.from_numpy(roughness)).numpy()
+    np.testing.assert_allclose(found, expected, atol=0.012)

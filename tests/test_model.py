@@ -127,8 +127,21 @@ def in_a_tube(samples: Samples) -> Samples:
     def uniform(low: float, high: float, *shape: int) -> torch.Tensor:
         return low + (high - low) * torch.rand(len(samples), *shape, generator=generator, dtype=torch.float64)
 
-    bounce = Bounce(uniform(-3, -1, 3), uniform(-0.5, 0), uniform(-4, -2), uniform(1, 2, 3), uniform(0, 0.1))
+    bounce = Bounce(
+        log=uniform(-3, -1, 3),
+        by_n=uniform(-0.5, 0),
+        by_q=uniform(-4, -2),
+        by_scale=uniform(1, 2, 3),
+        by_gamma=uniform(1, 4, 3),
+        gloss=uniform(0, 0.1),
+    )
     return replace(samples, bounce=bounce)
+
+
+def following(samples: Samples) -> Samples:
+    """The same samples, lit by tissue of ``made_materials`` and brighter as that gets brighter."""
+    shown = SHARED.gamma * made_materials(len(samples))[:, :3].log()
+    return replace(samples, bounce=replace(samples.bounce, shown=shown))
 
 
 SCENES = {
@@ -136,6 +149,7 @@ SCENES = {
     "beside the lens": beside_the_lens,
     "in a tube": in_a_tube,
     "beside the lens in a tube": lambda samples: in_a_tube(beside_the_lens(samples)),
+    "in a tube whose light follows its colours": lambda samples: following(in_a_tube(samples)),
 }
 BOUNCE_SHARED = Globals(torch.cat([SHARED.vector, torch.tensor([0.1], dtype=torch.float64)]))
 
@@ -274,8 +288,9 @@ def test_assembling_in_chunks_changes_nothing(equations, dense, triangles, monke
 @pytest.mark.parametrize("sin2", [DIFFUSE_SIN2 - 0.01, DIFFUSE_SIN2 + 0.01])
 def test_beside_bounced_light_only_highlights_tell_roughness(dense, triangles, sin2):
     samples = replace(dense[0], sin2=torch.full_like(dense[0].sin2, sin2))
-    bounce = Bounce(*(x.float() for x in vars(in_a_tube(samples).bounce).values()))
-    samples = replace(single(samples), bounce=bounce)
+    bounce = in_a_tube(samples).bounce
+    columns = {name: x.float() for name, x in vars(bounce).items() if x is not None}
+    samples = replace(single(samples), bounce=Bounce(**columns))
     pattern = MeshPattern(samples, triangles, 16)
     equations = assemble(
         samples, pattern, torch.from_numpy(triangles), dense[1].float(), BOUNCE_SHARED, WIDTH

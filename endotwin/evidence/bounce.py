@@ -10,8 +10,9 @@ import torch
 from endotwin.evidence.log_light import Bounced
 from endotwin.evidence.probe import Hypothesis, Probe
 from endotwin.light.bounced import Albedo, BouncedLight, Places
+from endotwin.light.forward import Lobes
 from endotwin.light.radiosity import Radiosity
-from endotwin.light.shading import F0_DIELECTRIC, ROUGHNESS_TISSUE, specular_albedo, specular_of_even_light
+from endotwin.light.shading import F0_DIELECTRIC, ROUGHNESS_TISSUE
 from endotwin.pixels.start import PRIOR
 
 CELL = 0.15
@@ -47,8 +48,8 @@ def bounced(probe: Probe, hypothesis: Hypothesis) -> Bounced:
     places = Places(radiosity.to_points(probe.local_points_mm, probe.local_normals), probe.frame)
     patch = radiosity.patch_of[samples.triangle.numpy()]
     linear = (np.maximum(samples.color.numpy(), 1) / 255.0) ** (1 / gamma)
-    glossy = specular_albedo(roughness, F0_DIELECTRIC).numpy()
-    gloss = specular_of_even_light(samples.cos, roughness, F0_DIELECTRIC)
+    lobes = Lobes(F0_DIELECTRIC)
+    glossy, gloss = lobes.glossy_albedo(roughness).numpy(), lobes.gloss(samples.cos, roughness)
     direct_light = probe.direct_light(hypothesis, n, q)
 
     def seen(irradiance: np.ndarray, base_color: np.ndarray) -> np.ndarray:

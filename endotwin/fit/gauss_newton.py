@@ -12,14 +12,17 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 import scipy.linalg
 import torch
 from torch import Tensor
 
+from endotwin.fit.frame_gains import FramePattern
 from endotwin.fit.hashgrid import HashOperator
-from endotwin.fit.model import Globals, at_pixels, predict
+from endotwin.fit.model import GLOBALS, Globals, at_pixels, predict
 from endotwin.fit.normal_equations import CHANNELS, MeshPattern, NormalEquations, assemble, robust_cost
 from endotwin.light.shading import F0_DIELECTRIC
 from endotwin.pixels.samples import Samples, drawn
@@ -53,6 +56,8 @@ AT_EDGE = 0.01
 """Beyond so many standard deviations of the prior, and so near an edge of their range in shares of one, n, q
 and γ are no endoscope's."""
 
+F0 = GLOBALS.index("ln f0")
+
 DARKEST, BRIGHTEST = 0.24, 0.9
 """Shares of the light between which the brightest tissue (98th percentile) reflects: less is asked for where
 no light bounces; more where a mesh lacks what throws light on it, until the tissue would be a furnace."""
@@ -62,6 +67,19 @@ COLOR_RANGE = (1e-3, 2.0)
 CG_TOLERANCE = 1e-3
 CG_STEPS = 25
 SEARCH_SAMPLES = 300_000
+
+DAMPING = 1 / 255
+"""Where light bounces, a step of light, response or the albedo's scale by one standard deviation of their
+prior must explain so much of the photos, as root mean square in display values: what it does to bounced light
+is known to first order only."""
+
+MOST_BRIGHTER = 0.5
+"""Of the logarithm of bounced light, by a step of the albedo's scale: it grows faster than that."""
+
+MOST_GAIN_STEP = 1.0
+"""Of the logarithm of a gain: a photo all black or white tells none, and its slope is next to nothing."""
+
+_NO_GAINS = np.zeros(0)
 LENGTHS = (1.0, 0.5, 0.25, 0.1, 0.03)
 """Of the line search, as shares of the full step."""
 
@@ -134,6 +152,15 @@ def prior_precision(operator: HashOperator, unit_mm: float) -> Tensor:
     return torch.stack([color, color, color, roughness], dim=1)
 
 
+class Step(NamedTuple):
+    """What a step has found: ``state``, by how much its cost ``fell`` (0: no step), and what it adds to ln of
+    each frame's gain, float64 [F], or [0] where gains were none of its business."""
+
+    state: State
+    fell: float
+    log_gain: np.ndarray
+
+
 class GaussNewton:
     """Steps on one set of samples with one operator.
 
@@ -194,19 +221,20 @@ class GaussNewton:
         """Negative log posterior, on the trial samples scaled up to all of them."""
         return self._cost(self._here(state), noise)
 
-    def _cost(self, state: State, noise: float) -> float:
+    def _cost(self, state: State, noise: float, log_gain: np.ndarray = _NO_GAINS) -> float:
         share = len(self.samples) / max(1, len(self._trial))
-        data = robust_cost(self._trial, self._predict(state), HUBER * noise) * share / (noise**2 * TEMPER)
+        predicted = self._predict(state, log_gain)
+        data = robust_cost(self._trial, predicted, HUBER * noise) * share / (noise**2 * TEMPER)
         prior = float((self.precision * state.table**2).double().sum()) / 2
         mean, spread = self._global_prior(state)
         return data + prior + float((((state.shared.vector - mean) / spread) ** 2).sum()) / 2
 
-    def step(self, state: State, joint: bool = True) -> tuple[State, float]:
-        """One Gauss–Newton step with a backtracking line search; the state and by how much its cost fell (0:
-        no step).
+    def step(self, state: State, joint: bool = True, gains: bool = False) -> Step:
+        """One Gauss–Newton step with a backtracking line search.
 
         Light, response and f0 move only in a ``joint`` step, which costs six times as much: interreflection
-        needs it, whose light depends on the albedo (see ``within`` for the others).
+        needs it, whose light depends on the albedo (see ``within`` for the others). With ``gains`` each
+        frame's moves with them.
         """
         given, state = state, self._here(state)
         noise = self._noise(state)
@@ -214,32 +242,63 @@ class GaussNewton:
         if self._placed is None:
             self._placed = self.samples.to(self._device)
         equations = assemble(
-            self._placed, self.pattern, self._triangles, state.materials, state.shared, HUBER * noise, joint
+            self._placed,
+            self.pattern,
+            self._triangles,
+            state.materials,
+            state.shared,
+            HUBER * noise,
+            joint,
+            self._frames if gains else None,
         )
         free = free_directions(state.shared, self.held) if joint else np.zeros((len(state.shared.vector), 0))
-        table_step, shared_step = self._solve(state, equations, scale, free)
+        before = self._cost(state, noise)
+        damping = len(self.samples) * scale * DAMPING**2 if state.shared.bounces else 0.0
+        table_step, shared_step = self._solve(state, equations, scale, free, damping)
         room = room_below_furnace(state, float(shared_step[-1])) if joint and state.shared.bounces else 1.0
         if room < LENGTHS[-1]:
             room, free = 1.0, free_directions(state.shared, (*self.held, "albedo scale"))
-            table_step, shared_step = self._solve(state, equations, scale, free)
+            table_step, shared_step = self._solve(state, equations, scale, free, damping)
         trusted = float((self._global_prior(state)[1] / shared_step.abs().clamp_min(1e-12)).min())
-        before = self._cost(state, noise)
+        if joint and state.shared.bounces:
+            brighter = float(shared_step[-1].abs() * self._trial.bounce.by_scale.mean())
+            trusted = min(trusted, MOST_BRIGHTER / max(brighter, 1e-12))
+        gain_step = np.zeros(0)
+        if gains:
+            vertex_step = state.link_slope * self._operator(table_step)
+            gain_step = equations.gains.step(vertex_step, shared_step.numpy())
+            trusted = min(trusted, MOST_GAIN_STEP / max(float(np.abs(gain_step).max()), 1e-12))
         for length in (min(1.0, room, trusted) * each for each in LENGTHS):
             moved = replace(
                 state,
                 table=state.table + length * table_step,
                 shared=bounded(state.shared, state.shared.vector + length * shared_step),
             )
-            after = self._cost(moved, noise)
+            after = self._cost(moved, noise, length * gain_step)
             if after < before:
-                return replace(given, table=moved.table.cpu(), shared=moved.shared), before - after
-        return given, 0.0
+                found = replace(given, table=moved.table.cpu(), shared=moved.shared)
+                return Step(found, before - after, length * gain_step)
+        return Step(given, 0.0, 0 * gain_step)
 
-    def _predict(self, state: State) -> Tensor:
-        return predict(self._trial, at_pixels(self._trial, self._triangles, state.materials), state.shared)
+    @cached_property
+    def _frames(self) -> FramePattern:
+        samples, pattern = self.samples, self.pattern
+        row, count = samples.views.row(samples.frame), len(samples.views.frames)
+        return FramePattern(pattern.corners[pattern.compact], row, pattern.vertex_count, count)
+
+    def _brightened(self, log_gain: np.ndarray) -> Samples:
+        """The trial samples with frames brighter by ``log_gain`` [F], or as they are by [0]."""
+        if not len(log_gain):
+            return self._trial
+        by_sample = torch.from_numpy(log_gain[self._frames.row[self.trial_rows.numpy()]]).float()
+        return replace(self._trial, log_exposure=self._trial.log_exposure + by_sample.to(self._device))
+
+    def _predict(self, state: State, log_gain: np.ndarray = _NO_GAINS) -> Tensor:
+        material = at_pixels(self._trial, self._triangles, state.materials)
+        return predict(self._brightened(log_gain), material, state.shared)
 
     def _solve(
-        self, state: State, equations: NormalEquations, scale: float, free: np.ndarray
+        self, state: State, equations: NormalEquations, scale: float, free: np.ndarray, damping: float
     ) -> tuple[Tensor, Tensor]:
         link = state.link_slope[..., None]
         mean, spread = self._global_prior(state)
@@ -265,7 +324,8 @@ class GaussNewton:
         if not joint:
             return solved[..., 0], torch.zeros_like(spread)
         pull = ((mean - state.shared.vector) / spread**2).numpy()
-        shared_normal = equations.shared * scale + np.diag(1 / spread.numpy() ** 2)
+        damped = np.where(np.arange(len(spread)) == F0, 1, 1 + damping)
+        shared_normal = equations.shared * scale + np.diag(damped / spread.numpy() ** 2)
         shared_right = free.T @ (equations.shared_right * scale + pull)
         weights, along = _joint_minimum(
             solved, product(solved), right, free.T @ shared_normal @ free, shared_right
@@ -404,17 +464,20 @@ def brightest(state: State) -> float:
 def as_bouncing(state: State, before: State) -> State:
     """``state`` with the albedo's scale such that light bounces as a step from ``before`` has found it.
 
-    A step takes the bounce for that of the old base colours, scaled: what the colours have gained since would
-    bounce on top, and scale and colours would swing against each other from step to step.
+    A step takes the bounce for that of the old base colours, seen through the new response and scaled: what
+    the colours have gained since would bounce on top, and scale and colours would swing against each other
+    from step to step.
     """
-    gained = (state.materials[:, :3].mean(dim=0) / before.materials[:, :3].mean(dim=0)).log().mean()
+    old = replace(before, shared=state.shared).materials[:, :3]
+    gained = (state.materials[:, :3].mean(dim=0) / old.mean(dim=0)).log().mean()
     return rescaled(state, state.shared.log_scale - float(gained))
 
 
-def recolored(state: State, log_factor: Tensor) -> State:
-    """``state`` with base colours times factors whose logarithms are ``log_factor`` [V, 3]."""
-    factor = torch.cat([(state.shared.gamma * log_factor).exp(), torch.ones(len(log_factor), 1)], dim=1)
-    return replace(state, operator=None, mean=state.raw * factor, table=None)
+def halfway(state: State, other: State) -> State:
+    """The state between two of one operator and mean."""
+    vector = (state.shared.vector + other.shared.vector) / 2
+    shared = replace(other.shared, vector=vector)
+    return replace(other, table=(state.table + other.table) / 2, shared=shared)
 
 
 def rescaled(state: State, log_scale: float) -> State:

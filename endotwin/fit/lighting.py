@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -13,21 +13,17 @@ from torch import Tensor
 from endotwin.effects import Effects
 from endotwin.effects.gain import Gain
 from endotwin.effects.offset import Offset
-from endotwin.fit.gauss_newton import HUBER, GaussNewton, State, recolored
-from endotwin.fit.model import Globals, at_pixels, radiance, slope_by_log_exposure
+from endotwin.fit.gauss_newton import HUBER, MOST_GAIN_STEP, GaussNewton, State
+from endotwin.fit.model import Globals, at_pixels, slope_by_log_exposure
 from endotwin.fit.normal_equations import Residual
 from endotwin.fit.within import Renewed, Varied
-from endotwin.light import shading
-from endotwin.light.bounced import Albedo, BouncedLight, Places
+from endotwin.light.bounced import GAMMA_STEP, Albedo, BouncedLight, Places
 from endotwin.light.guides import AT_LENS, COSINE, Guided, guided, log_axis, visible_from
 from endotwin.light.radiosity import Radiosity
 from endotwin.pixels.samples import Samples, Views
 from endotwin.surface import Surface
 from endotwin.surface.casting import Caster
 from endotwin.surface.vectors import unit
-
-MOST_STEP = 1.0
-"""Of the logarithm of a gain: a photo all black or white tells none, and its slope is next to nothing."""
 
 
 def lit(samples: Samples, surface: Surface, caster: Caster, effects: Effects) -> Samples:
@@ -98,7 +94,6 @@ class Relighting:
         self.effects = effects
         self._surface, self._caster = surface, caster
         self._bouncer = Bouncer(surface, caster, effects, views) if effects.bounce else None
-        self._asked: Asked | None = None
 
     @property
     def bounces(self) -> bool:
@@ -123,10 +118,8 @@ class Relighting:
 
     def vary(self, solver: GaussNewton, found: Renewed) -> None:
         """Gains and guides as a step has ``found`` them, and the samples of ``solver`` lit so."""
+        self.brighten(solver, found.log_gain)
         samples = solver.samples
-        if len(found.log_gain):
-            self.effects = _brightened(self.effects, found.log_gain)
-            samples = exposed(samples, self.effects)
         if len(found.aside_mm):
             guides_mm = np.asarray(self.effects.guides_mm) + found.aside_mm
             guides_mm[:, 2] = np.minimum(guides_mm[:, 2], 0)
@@ -134,6 +127,12 @@ class Relighting:
             samples = self.guided(samples)
         if samples is not solver.samples:
             solver.relight(samples)
+
+    def brighten(self, solver: GaussNewton, log_gain: np.ndarray) -> None:
+        """Frames brighter by ``log_gain`` [F], or as they are by [0], and the samples of ``solver`` so."""
+        if len(log_gain):
+            self.effects = _brightened(self.effects, log_gain)
+            solver.relight(exposed(solver.samples, self.effects))
 
     def guided(self, samples: Samples) -> Samples:
         """``samples`` lit by the guides where they were found last."""
@@ -143,7 +142,7 @@ class Relighting:
 
     def without_bounce(self, solver: GaussNewton, state: State) -> State:
         """From here on no light bounces: the photos show none. ``state`` as if there had never been any."""
-        self._bouncer = self._asked = None
+        self._bouncer = None
         self.effects = self.effects.including(replace(self.effects["interreflection"], strength=0.0))
         solver.relight(replace(solver.samples, bounce=None))
         return replace(state, shared=state.shared.without_scale())
@@ -162,34 +161,9 @@ class Relighting:
         samples = self.bounced(samples, triangles, state)
         return exposed(samples, self.effects) if "gain" in self.effects else samples
 
-    def asked(self, solver: GaussNewton, state: State) -> None:
-        """Hold that a step of ``solver`` has found ``state`` beside the light of its samples."""
-        if self.bounces:
-            self._asked = Asked.of(solver, state)
-
-    def at_rest(self, solver: GaussNewton, state: State) -> State:
-        """``state``, found by steps of ``solver``, in colours that throw the light beside which they were
-        found: what a renderer makes of them then looks as they were fitted."""
-        if not self._has_asked(solver):
-            return state
-        samples = self.relit(solver.samples, solver.triangles, state)
-        _, factor = self._asked.settled(_log_thrown(samples, state.shared))
-        vertex, count = samples.nearest(solver.triangles.numpy()), len(state.raw)
-        seen = np.bincount(vertex, minlength=count)
-        sums = np.stack([np.bincount(vertex, column, count) for column in factor.numpy().T], axis=1)
-        mean = np.where(seen[:, None] > 0, sums / np.maximum(seen, 1)[:, None], factor.numpy().mean(axis=0))
-        return recolored(state, torch.from_numpy(mean.astype(np.float32)))
-
-    def _has_asked(self, solver: GaussNewton) -> bool:
-        return self._asked is not None and self._asked.solver is solver
-
     def __call__(self, solver: GaussNewton, state: State) -> None:
         """Relight the samples of ``solver`` as ``state`` says."""
         samples = self.relit(solver.samples, solver.triangles, state)
-        if self._has_asked(solver):
-            thrown = _log_thrown(samples, state.shared)
-            settled, _ = self._asked.settled(thrown)
-            samples = replace(samples, bounce=samples.bounce.brighter(settled - thrown))
         if "gain" in self.effects and state.textured:
             solver.relight(samples)
             width = HUBER * solver.noise(state)
@@ -198,41 +172,6 @@ class Relighting:
             samples = exposed(samples, self.effects)
         if self.needed:
             solver.relight(samples)
-
-
-@dataclass(frozen=True)
-class Asked:
-    """The light beside which a step of ``solver`` has found materials at its N samples.
-
-    Brighter tissue throws more light, under which the photos ask for darker tissue. Each found beside the
-    last of the other, the two swing ever wider where light grows by more than the colour that throws it.
-
-    Attributes:
-        log_light: ln of indirect irradiance [N, 3]. share: of the radiance that is by it. by_color: d ln
-            irradiance / d ln albedo, all tissue about a place changing with it.
-    """
-
-    solver: GaussNewton
-    log_light: Tensor
-    share: Tensor
-    by_color: Tensor
-
-    @classmethod
-    def of(cls, solver: GaussNewton, state: State) -> Asked:
-        samples, shared = solver.samples, state.shared
-        material = at_pixels(samples, solver.triangles, state.materials)
-        whole = radiance(samples, material, shared).clamp_min(shading.RADIANCE_MIN)
-        share = (1 - radiance(replace(samples, bounce=None), material, shared) / whole).clamp(0, 1)
-        return cls(solver, _log_thrown(samples, shared), share, samples.bounce.by_scale)
-
-    def settled(self, log_thrown: Tensor) -> tuple[Tensor, Tensor]:
-        """ln of the light beside which colours that photos ask for throw it, where those found so far throw
-        ``log_thrown`` [N, 3]; and of the factor that this makes on them.
-
-        Newton's step place by place: of changes that vary faster than ``by_color`` takes them to, a part.
-        """
-        grown = (log_thrown - self.log_light) / (1 + self.share * self.by_color)
-        return self.log_light + grown, -self.share * grown
 
 
 class Bouncer:
@@ -250,12 +189,17 @@ class Bouncer:
         """``samples``, whose ``roughness`` is [N], with the bounce under the light of ``shared`` and
         ``materials`` [V, 4] at the corners of ``triangles`` [F, 3]."""
         _, n, q = shared.log_light
-        scale, f0 = shared.log_scale, shared.f0 * math.exp(shared.log_scale)
-        albedo = Albedo.of(self._radiosity, materials[:, :3], materials[:, 3], f0, triangles.numpy())
+        scale, lobes = shared.log_scale, shared.lobes.brighter(math.exp(shared.log_scale))
+        albedo = Albedo.of(self._radiosity, materials[:, :3], materials[:, 3], lobes, triangles.numpy())
         vertex = samples.nearest(self._surface.triangles)
         places = Places(self._radiosity.to_vertex[vertex], samples.views.row(samples.frame))
-        gloss = shading.specular_of_even_light(samples.cos, roughness, f0) * math.exp(-scale)
-        return replace(samples, bounce=self._light.expanded(places, n, q, albedo, gloss, scale))
+        gloss = lobes.gloss(samples.cos, roughness) * math.exp(-scale)
+        steeper = materials[:, :3] ** (shared.gamma / (shared.gamma + GAMMA_STEP))
+        other = Albedo.of(self._radiosity, steeper, materials[:, 3], lobes, triangles.numpy())
+        seen_by = (shared.gamma, other)
+        bounce = self._light.expanded(places, n, q, albedo, gloss, scale, seen_by)
+        shown = shared.gamma * torch.log(at_pixels(samples, triangles, materials[:, :3]))
+        return replace(samples, bounce=replace(bounce, shown=shown))
 
 
 def regained(samples: Samples, material: Tensor, shared: Globals, effects: Effects, width: float) -> Effects:
@@ -277,10 +221,5 @@ def regained(samples: Samples, material: Tensor, shared: Globals, effects: Effec
 
 
 def _brightened(effects: Effects, log_gain: np.ndarray) -> Effects:
-    gain, step = effects["gain"], np.clip(log_gain, -MOST_STEP, MOST_STEP)
+    gain, step = effects["gain"], np.clip(log_gain, -MOST_GAIN_STEP, MOST_GAIN_STEP)
     return effects.including(Gain.centred(gain.frames, np.add(gain.log_gain, step)))
-
-
-def _log_thrown(samples: Samples, shared: Globals) -> Tensor:
-    """ln of the indirect irradiance at N ``samples`` with L0 = 1, [N, 3]."""
-    return samples.bounce.log_irradiance(*shared.log_light[1:], shared.log_scale)

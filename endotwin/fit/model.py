@@ -11,7 +11,7 @@ from torch import Tensor
 
 from endotwin.effects.coat import Coat
 from endotwin.light import forward, shading
-from endotwin.light.forward import Lobes
+from endotwin.light.forward import Lit, Lobes
 from endotwin.pixels.samples import Samples
 from endotwin.twin import Light, Response
 
@@ -78,6 +78,11 @@ class Globals:
         """ln of the factor on all albedo; 0 without interreflection."""
         return float(self.vector[5]) if self.bounces else 0.0
 
+    @property
+    def bouncing(self) -> tuple[float, float, float, float]:
+        """What says how light bounces: n, q, ln of the albedo's scale, γ."""
+        return (*self.log_light[1:], self.log_scale, self.gamma)
+
 
 def at_pixels(samples: Samples, triangles: Tensor, per_vertex: Tensor) -> Tensor:
     """Vertex values [V, C] interpolated at the samples, [N, C]; ``triangles`` int64 [F, 3]."""
@@ -87,8 +92,16 @@ def at_pixels(samples: Samples, triangles: Tensor, per_vertex: Tensor) -> Tensor
 
 def radiance(samples: Samples, material: Tensor, shared: Globals) -> Tensor:
     """Radiance x [N, 3] of the samples with ``material``: base colour and roughness at the pixels, [N, 4]."""
-    lit = samples.lit(*shared.log_light[1:], shared.log_scale)
+    lit = _lit(samples, material[:, :3], shared)
     return forward.radiance(lit, shared.log_light, material[:, :3], material[:, 3], shared.lobes)
+
+
+def _lit(samples: Samples, base_color: Tensor, shared: Globals) -> Lit:
+    """What lights the samples, where light bounced off tissue of ``base_color`` [N, 3]."""
+    lit, bounce = samples.lit(*shared.bouncing), samples.bounce
+    if bounce is None or bounce.shown is None:
+        return lit
+    return replace(lit, irradiance=lit.irradiance * bounce.followed(torch.log(base_color), shared.gamma))
 
 
 def predict(samples: Samples, material: Tensor, shared: Globals) -> Tensor:
@@ -126,7 +139,7 @@ def linearise(samples: Samples, material: Tensor, shared: Globals) -> Linearised
     differentiation.
     """
     lobes, log_light = shared.lobes, shared.log_light
-    lit = samples.lit(*log_light[1:], shared.log_scale)
+    lit = _lit(samples, material[:, :3], shared)
     roughness = material[:, 3].detach().requires_grad_()
     with torch.enable_grad():
         shares = forward.shares(lit, log_light, roughness, lobes)
@@ -159,6 +172,10 @@ def linearise(samples: Samples, material: Tensor, shared: Globals) -> Linearised
     by_light = slope / gamma
     by_gamma = power * log_x - floor * log_floor - by_light * (log_L0 * x + n * axis - q * distance)
     by_gamma = by_gamma - by_color * base_color * torch.log(base_color) / gamma
+    if samples.bounce is not None:
+        by_gamma = by_gamma + slope * glow * samples.bounce.by_gamma
+        if samples.bounce.shown is not None:
+            by_color = by_color + slope * glow * samples.bounce.following / base_color
     by_globals = [by_light * x, by_light * axis, -by_light * distance, by_gamma, slope * shine[:, None]]
     if samples.bounce is not None:
         by_globals.append(slope * glow * samples.bounce.by_scale)

@@ -7,13 +7,14 @@ parameters border it.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.sparse
 import torch
 from torch import Tensor
 
+from endotwin.fit.frame_gains import FrameBorder, FramePattern, FrameSums
 from endotwin.fit.model import Globals, at_pixels, linearise
 from endotwin.pixels.samples import Samples
 from endotwin.pixels.start import DIFFUSE_SIN2
@@ -95,6 +96,7 @@ class NormalEquations:
         roughness: CSR [V, V].
         right: float32 [V, 4, 1 + G], JᵀW(e | dC by the G shared parameters) by channel.
         shared: float64 [G, G] and shared_right [G], those of the shared parameters.
+        gains: of frames, eliminated from all of them; None: there are none.
     """
 
     color: list[Tensor]
@@ -103,13 +105,26 @@ class NormalEquations:
     right: Tensor
     shared: np.ndarray
     shared_right: np.ndarray
+    gains: FrameBorder | None = None
+
+    def beside(self, gains: FrameBorder) -> NormalEquations:
+        """These without the ``gains``, which follow whatever the rest does."""
+        taken = gains.shared()
+        return replace(
+            self,
+            right=self.right - gains.right(self.right.shape),
+            shared=self.shared - taken[1:, 1:],
+            shared_right=self.shared_right - taken[1:, 0],
+            gains=gains,
+        )
 
     def __matmul__(self, values: Tensor) -> Tensor:
         """Product with vertex values [V, 4, K]."""
         v = [values[:, channel].contiguous() for channel in range(CHANNELS)]
         rows = [self.color[c] @ v[c] + self.mixed[c] @ v[3] for c in range(3)]
         rows.append(self.roughness @ v[3] + sum(self.mixed[c] @ v[c] for c in range(3)))
-        return torch.stack(rows, dim=1)
+        product = torch.stack(rows, dim=1)
+        return product if self.gains is None else product - self.gains.product(values)
 
     def lumped(self) -> Tensor:
         """Row sums as one symmetric 4×4 block a vertex, [V, 4, 4]."""
@@ -162,9 +177,10 @@ def assemble(
     shared: Globals,
     width: float,
     bordered: bool = True,
+    frames: FramePattern | None = None,
 ) -> NormalEquations:
     """Linearise at vertex ``materials`` [V, 4] and ``shared``, and sum over the samples; G is 0 unless
-    ``bordered``.
+    ``bordered``. Gains of the samples' ``frames`` are eliminated; None: they stay.
 
     Beside bounced light, pixels beyond DIFFUSE_SIN2 tell no roughness: it is known by patches only, and errs
     by more than the little that roughness does to Burley's diffuse lobe.
@@ -174,6 +190,7 @@ def assemble(
     pair_sums = torch.zeros(count, len(CORNER_PAIRS), 7, device=device)
     corner_sums = torch.zeros(count, 3, CHANNELS * (1 + globals_count), device=device)
     every_id = torch.from_numpy(pattern.compact).to(device)
+    sums = None if frames is None else FrameSums(frames, CHANNELS, globals_count)
     normal, right = np.zeros((globals_count,) * 2), np.zeros(globals_count)
     for start, part in zip(range(0, len(samples), CHUNK), samples.chunks(CHUNK), strict=True):
         model = linearise(part, at_pixels(part, triangles, materials), shared)
@@ -198,6 +215,15 @@ def assemble(
             dim=1,
         ).flatten(1)
         _add(corner_sums, ids, corner, channels)
+        if sums is not None:
+            by_gain = shared.gamma * model.by_globals[..., :1]
+            pulled = (residual.weight * by_gain[..., 0])[..., None]
+            materials_too = torch.cat(
+                [pulled[..., 0] * model.by_color, (pulled[..., 0] * by_roughness).sum(dim=1, keepdim=True)],
+                dim=1,
+            )
+            others = torch.cat([by_gain, against], dim=2)
+            sums.add(slice(start, start + len(part)), corner, pulled[..., 0], materials_too, others)
         slopes = slopes.flatten(0, 1)
         weighted = (slopes * residual.weight.reshape(-1, 1)).T
         normal += (weighted @ slopes).double().cpu().numpy()
@@ -205,7 +231,7 @@ def assemble(
     vertex = pattern.vector(corner_sums.cpu().numpy()).astype(np.float32)
     pair_sums = pair_sums.cpu().numpy()
     matrices = [pattern.matrix(pair_sums[:, :, k]).to(device) for k in range(7)]
-    return NormalEquations(
+    equations = NormalEquations(
         color=matrices[:3],
         mixed=matrices[3:6],
         roughness=matrices[6],
@@ -213,3 +239,4 @@ def assemble(
         shared=normal,
         shared_right=right,
     )
+    return equations if sums is None else equations.beside(sums.border(device))

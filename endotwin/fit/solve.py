@@ -26,6 +26,7 @@ from endotwin.fit.gauss_newton import (
     GaussNewton,
     State,
     as_bouncing,
+    halfway,
     roughness_to_raw,
     too_dark,
     unusual,
@@ -62,7 +63,14 @@ HOLD_STEPS, BOUNCE_STEPS = 1, 9
 """Steps where light is bounced, and depends on the materials; before HOLD_STEPS the albedo's scale is
 held."""
 
-COAT_STEP = 2
+WORSE, HALVINGS = 1.25, 2
+"""A step under whose light the photos cost so many times what they did is too long, and halved so often."""
+
+BOUNCE_HELD = ("q", "L0")
+"""Where light bounces, q stays where the fit starts, at the inverse square of a small light: what the bounce
+off a mesh errs by would bend it, and γ with it. L0 is told by the albedo's scale."""
+
+COAT_STEP, BOUNCE_COAT_STEP = 2, 4
 """A coat that nobody asked for is judged when light and materials are near."""
 
 LIGHT_SHARE = 0.25
@@ -245,21 +253,20 @@ def _find_light(
     ready = pace.stopwatch.total
     state, _ = _stepped(solver, state, relighting, joint=False)
     step_s = pace.stopwatch.total - ready
-    number, steps = 0, BOUNCE_STEPS if relighting.bounces else LIGHT_STEPS
-    judged = None
+    number, steps, coat_step = 0, LIGHT_STEPS, COAT_STEP
+    if relighting.bounces:
+        steps, coat_step = BOUNCE_STEPS, BOUNCE_COAT_STEP
+    judged = best = None
     while number < steps:
         late = pace.left(LIGHT) <= 2 * step_s
         if late and (relighting.bounces or number):
             break
-        if relighting.bounces:
-            state = without_furnace(state)
-            if too_dark(state):
-                state, steps = relighting.without_bounce(solver, state), number + LIGHT_STEPS
-        relighting(solver, state)
+        if relighting.bounces and too_dark(state):
+            state, steps = relighting.without_bounce(solver, state), number + LIGHT_STEPS
         within = Within.of(solver.samples, surface, unit)
         material = at_pixels(solver.samples, solver.triangles, state.materials)
         shared, noise = state.shared, solver.noise(state)
-        if number == (0 if coat == "on" else COAT_STEP):
+        if number == (0 if coat == "on" else coat_step):
             under = relighting.relit(relighting.guided(clipped), solver.triangles, state)
             shiny = Samples.joined([solver.samples, under], solver.samples.views)
             seen = Within.of(shiny, surface, unit)
@@ -267,7 +274,7 @@ def _find_light(
             layer, judged = judged_coat(seen.highlights(seen_material, shared, noise), coat)
             shared = replace(shared, coat=layer)
         if relighting.bounces:
-            solver.held = (*start.undetermined, "L0", *(("albedo scale",) * (number < HOLD_STEPS)))
+            solver.held = (*start.undetermined, *BOUNCE_HELD, *(("albedo scale",) * (number < HOLD_STEPS)))
             found = within.shone(material, shared, noise) if shared.coat else Renewed(shared)
         else:
             found = within.renewed(material, shared, start.undetermined, noise, relighting.varied)
@@ -278,23 +285,60 @@ def _find_light(
             break
         state, gain = _stepped(solver, state, relighting, joint=relighting.bounces)
         number += 1
+        if relighting.bounces and number > coat_step:
+            best = _better(best, solver, state)
         pace.report("find the light", number, steps)
         if gain < CONVERGED * solver.cost(state, solver.noise(state)):
-            number = max(number, COAT_STEP) if judged is None else steps
-    if relighting.bounces:
-        state = without_furnace(state)
+            number = max(number, coat_step) if judged is None else steps
+    if relighting.bounces and best is not None:
+        state = best.state
+        relighting(solver, state)
     cost = _Cost(ready - began, step_s, len(points) * len(operator.cells_mm), len(samples))
     return state, cost, judged or Decision("off", "no time to judge")
 
 
+@dataclass(frozen=True)
+class _Best:
+    """A ``state`` that costs least under its own light, by the ``noise`` at which others are held to it."""
+
+    state: State
+    cost: float
+    noise: float
+
+
+def _better(best: _Best | None, solver: GaussNewton, state: State) -> _Best:
+    """``state``, by which the samples of ``solver`` are lit, or the ``best`` so far if that costs less."""
+    noise = solver.noise(state) if best is None else best.noise
+    cost = solver.cost(state, noise)
+    return best if best is not None and best.cost <= cost else _Best(state, cost, noise)
+
+
 def _stepped(solver: GaussNewton, state: State, relighting: Relighting, joint: bool) -> tuple[State, float]:
-    """A step of ``solver``, of the materials alone where a ``joint`` one finds nothing lower, and by how much
-    the cost fell; light bounces after it as it was found to."""
-    stepped, gain = solver.step(state, joint)
-    if joint and not gain:
-        stepped, gain = solver.step(state, joint=False)
-    relighting.asked(solver, stepped)
-    return as_bouncing(stepped, state) if relighting.bounces else stepped, gain
+    """A step of ``solver``, of the materials alone where a ``joint`` one finds nothing lower, with the
+    samples relit by what it has found; and by how much the cost fell.
+
+    A step knows what it does to bounced light to first order. Where that was too far, it goes half the way.
+    """
+    found = solver.step(state, joint, gains=joint and "gain" in relighting.effects)
+    if joint and not found.fell:
+        found = solver.step(state, joint=False)
+    relighting.brighten(solver, found.log_gain)
+    moved = found.state
+    if not relighting.bounces:
+        relighting(solver, moved)
+        return moved, found.fell
+    if not joint:
+        moved = as_bouncing(moved, state)
+    noise = solver.noise(state)
+    before = solver.cost(state, noise)
+    for halving in range(HALVINGS + 1):
+        moved = without_furnace(moved)
+        relighting(solver, moved)
+        after = solver.cost(moved, noise)
+        if after <= WORSE * before or halving == HALVINGS:
+            break
+        moved = halfway(state, moved)
+    return moved, max(before - after, 0.0)
 
 
 def _find_detail(
@@ -338,8 +382,7 @@ def _find_detail(
             break
         before = pace.stopwatch.total
         relighting(solver, state)
-        state, _ = solver.step(state, joint=False)
-        relighting.asked(solver, state)
+        state = solver.step(state, joint=False).state
         step_s = pace.stopwatch.total - before
         pace.report("find the detail", number + 1, pace.plan.steps)
     tilter = Tilter(solver, state, relighting.effects)
@@ -348,7 +391,7 @@ def _find_detail(
             break
         normals = tilter.tilted(normals)
         pace.report("tilt the normals", number + 1, pace.plan.tilts)
-    return relighting.at_rest(solver, state), normals, solver.noise(state)
+    return state, normals, solver.noise(state)
 
 
 def _light_grid(unit: float) -> HashGrid:

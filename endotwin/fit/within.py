@@ -23,6 +23,7 @@ from torch import Tensor
 from endotwin.effects.coat import Coat
 from endotwin.evidence.coat import LEAST_SIGHTINGS, Highlights
 from endotwin.fit.gauss_newton import (
+    F0,
     ROUGHNESS_LOGIT_SPREAD,
     TEMPER,
     bounded,
@@ -30,7 +31,7 @@ from endotwin.fit.gauss_newton import (
     global_prior,
     roughness_slope,
 )
-from endotwin.fit.model import GLOBALS, Globals, linearise, predict
+from endotwin.fit.model import Globals, linearise, predict
 from endotwin.light import shading
 from endotwin.pixels.fixed_effects import Design, regress
 from endotwin.pixels.samples import Samples
@@ -49,7 +50,6 @@ COAT_SPREAD = 2.0
 HIGHLIGHT_PIXELS = 30_000
 """Of the highlights, all of some vertices; more would not change the mind about a coat."""
 
-F0 = GLOBALS.index("ln f0")
 REWEIGHTS = 4
 
 ASIDE = 0.005

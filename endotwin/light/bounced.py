@@ -6,19 +6,29 @@ n and q and of how bright the tissue is.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import scipy.sparse
 import torch
 from torch import Tensor
 
+from endotwin.light.forward import Lobes
 from endotwin.light.radiosity import Radiosity
-from endotwin.light.shading import specular_albedo
 from endotwin.surface.rows import Rows
 
 LIGHT_STEP = 0.05
 """Step of the finite differences of the bounced light, in n, q and the logarithm of all albedo."""
+
+GAMMA_STEP = 0.01
+"""That in γ."""
+
+ALIKE = 0.5
+"""Light follows a change of all colours in full, and that of a single place not at all. Taken for halfway,
+both settle from step to step: of an error, no more than s/2 / (1 + s/2) is left where s = share·by_scale."""
+
+MOST_FOLLOWED = 1.0
+"""Of the logarithm of bounced light, that it follows the colours at once."""
 
 DARKEST = 1e-30
 
@@ -28,7 +38,7 @@ class Albedo:
     """How much of the light from all around patches send back.
 
     Attributes:
-        base_color: float [P, 3], by the diffuse lobe. glossy: float [P, 1], by the white specular one.
+        base_color: float [P, 3], by the diffuse lobe. glossy: float [P, 1], by the white ones.
     """
 
     base_color: np.ndarray
@@ -36,11 +46,11 @@ class Albedo:
 
     @classmethod
     def of(
-        cls, radiosity: Radiosity, base_color: Tensor, roughness: Tensor, f0: float, triangles: np.ndarray
+        cls, radiosity: Radiosity, base_color: Tensor, roughness: Tensor, lobes: Lobes, triangles: np.ndarray
     ) -> Albedo:
         """That of a surface with ``base_color`` [V, 3] and ``roughness`` [V] at its vertices; ``triangles``
         int [F, 3] are those of the radiosity's surface, whose vertices may be merged."""
-        answer = torch.cat([base_color, specular_albedo(roughness, f0)[:, None]], dim=1).numpy()
+        answer = torch.cat([base_color, lobes.glossy_albedo(roughness)[:, None]], dim=1).numpy()
         corners = [answer.take(triangles[:, k], axis=0) for k in range(3)]
         mean = radiosity.mean(sum(corners) / np.float32(3))
         return cls(mean[:, :3], mean[:, 3:])
@@ -76,35 +86,44 @@ class Places:
 
 @dataclass(frozen=True)
 class Bounce(Rows):
-    """Indirect irradiance at N points, E = L0·exp(log + n·by_n + q·by_q + ln κ·by_scale), κ a factor on
-    all albedo.
+    """Indirect irradiance at N points, E = L0·exp(log + n·by_n + q·by_q + ln κ·by_scale + γ·by_gamma), κ a
+    factor on all albedo, γ the response through which photos show it.
 
     Attributes:
-        log, by_scale: float32 [N, 3]. by_n, by_q: float32 [N], the channels' mean.
-        gloss: float32 [N], share of it that the specular lobe sends to the camera.
+        log, by_scale, by_gamma: float32 [N, 3]. by_n, by_q: float32 [N], the channels' mean.
+        gloss: float32 [N], share of it that the white lobes send to the camera.
+        shown: float32 [N, 3], γ·ln of the points' base colours that throw it; None: it follows no colours.
     """
 
     log: Tensor
     by_n: Tensor
     by_q: Tensor
     by_scale: Tensor
+    by_gamma: Tensor
     gloss: Tensor
+    shown: Tensor | None = None
 
     def to(self, device: torch.device) -> Bounce:
         """The same on ``device``."""
-        return Bounce(**{name: value.to(device) for name, value in vars(self).items()})
+        return Bounce(**{name: None if x is None else x.to(device) for name, x in vars(self).items()})
 
-    def brighter(self, log_factor: Tensor) -> Bounce:
-        """The same, brighter by factors of logarithm ``log_factor`` [N, 3]."""
-        return replace(self, log=self.log + log_factor)
-
-    def irradiance(self, n: float, q: float, log_scale: float = 0.0) -> Tensor:
+    def irradiance(self, n: float, q: float, log_scale: float = 0.0, gamma: float = 0.0) -> Tensor:
         """E with L0 = 1, [N, 3]."""
-        return torch.exp(self.log_irradiance(n, q, log_scale))
+        return torch.exp(self.log_irradiance(n, q, log_scale, gamma))
 
-    def log_irradiance(self, n: float, q: float, log_scale: float = 0.0) -> Tensor:
+    def log_irradiance(self, n: float, q: float, log_scale: float = 0.0, gamma: float = 0.0) -> Tensor:
         by_light = (n * self.by_n + q * self.by_q)[:, None]
-        return self.log + by_light + log_scale * self.by_scale
+        return self.log + by_light + log_scale * self.by_scale + gamma * self.by_gamma
+
+    @property
+    def following(self) -> Tensor:
+        """d ln E / d ln base colour of the points, [N, 3], as far as the tissue about them changes alike."""
+        return ALIKE * self.by_scale
+
+    def followed(self, log_color: Tensor, gamma: float) -> Tensor:
+        """Factor [N, 3] on it with base colours of logarithm ``log_color`` [N, 3]."""
+        log_factor = self.following * (log_color - self.shown / gamma)
+        return torch.exp(log_factor.clamp(-MOST_FOLLOWED, MOST_FOLLOWED))
 
 
 class BouncedLight:
@@ -128,14 +147,22 @@ class BouncedLight:
         return places.of(self._radiosity.indirect(np.stack(direct, axis=1), albedo))
 
     def expanded(
-        self, places: Places, n: float, q: float, albedo: Albedo, gloss: Tensor, log_scale: float = 0.0
+        self,
+        places: Places,
+        n: float,
+        q: float,
+        albedo: Albedo,
+        gloss: Tensor,
+        log_scale: float = 0.0,
+        seen_by: tuple[float, Albedo] | None = None,
     ) -> Bounce:
-        """The bounce as a function of n, q and the albedo's scale, exact where they are as given here.
+        """The bounce as a function of n, q, the albedo's scale and γ, exact where they are as given here.
 
-        ``gloss`` [N] is the bounce's.
+        ``gloss`` [N] is the bounce's. ``seen_by``: γ, and the albedo that photos tell of with γ + GAMMA_STEP;
+        None: whatever γ, the albedo is the same.
         """
 
-        def log_irradiance(n: float, q: float, log_scale: float) -> np.ndarray:
+        def log_irradiance(n: float, q: float, log_scale: float, albedo: Albedo = albedo) -> np.ndarray:
             return np.log(np.maximum(self.at(places, n, q, albedo.scaled(log_scale)), DARKEST))
 
         here = log_irradiance(n, q, log_scale)
@@ -145,9 +172,14 @@ class BouncedLight:
             (n, q, log_scale + LIGHT_STEP),
         )
         by_n, by_q, by_scale = ((log_irradiance(*at) - here) / LIGHT_STEP for at in moved)
+        gamma, by_gamma = 0.0, np.zeros_like(here)
+        if seen_by is not None:
+            gamma, other = seen_by
+            by_gamma = (log_irradiance(n, q, log_scale, other) - here) / GAMMA_STEP
         by_n, by_q = by_n.mean(axis=1), by_q.mean(axis=1)
-        level = here - (n * by_n + q * by_q)[:, None] - log_scale * by_scale
+        level = here - (n * by_n + q * by_q)[:, None] - log_scale * by_scale - gamma * by_gamma
         columns = [
-            torch.from_numpy(np.ascontiguousarray(x, np.float32)) for x in (level, by_n, by_q, by_scale)
+            torch.from_numpy(np.ascontiguousarray(x, np.float32))
+            for x in (level, by_n, by_q, by_scale, by_gamma)
         ]
         return Bounce(*columns, gloss)

@@ -2,16 +2,17 @@
 
 x = Σ_k g_k·(D_k·b/π + f0·S_k + w·f0_water·S'_k) + 2·L0·E·(b + ρ), with g = 2π·L·(n·ωi) of each light guide, D
 the diffuse factor, S the specular lobe of the tissue and S' that of a coat of weight w, E what other tissue
-throws on the point for L0 = 1, and ρ the lobe's share of that. Han & Wu 2025 with one guide at the lens, no
-coat and no E; Burley's diffuse lobe unless D is 1. It is linear in the base colour b, and in what each guide
-gives exponential in n and q: the derivatives by those follow from the same pieces.
+throws on the point for L0 = 1, and ρ the white lobes' share of that. Han & Wu 2025 with one guide at the
+lens, no coat and no E; Burley's diffuse lobe unless D is 1. It is linear in the base colour b, and in what
+each guide gives exponential in n and q: the derivatives by those follow from the same pieces.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -30,7 +31,7 @@ class Lit:
         cos_o: [N], n·wo. guides: how each of K guides lights them.
         log_exposure: [N], ln of what camera and lens make of all light; None: 0.
         irradiance: [N, 3], what other tissue throws on them for L0 = 1; None: nothing.
-        gloss: [N], share of that irradiance which the specular lobe sends to the camera.
+        gloss: [N], share of that irradiance which the white lobes send to the camera.
     """
 
     cos_o: Tensor
@@ -59,6 +60,29 @@ class Lobes:
     f0: float
     burley: bool = True
     coat: tuple[float, float, float] | None = None
+
+    def brighter(self, factor: float) -> Lobes:
+        """The same with white lobes brighter by ``factor``."""
+        coat = self.coat and (factor * self.coat[0], *self.coat[1:])
+        return replace(self, f0=factor * self.f0, coat=coat)
+
+    def gloss(self, cos_o: Tensor, roughness: Tensor) -> Tensor:
+        """Share of light from all around that the white lobes of points of ``roughness`` send to the camera,
+        [N]."""
+        share = torch.zeros_like(cos_o * roughness)
+        if self.f0 > 0:
+            share = share + shading.specular_of_even_light(cos_o, roughness, self.f0)
+        if self.coat is not None:
+            weight, smooth, _ = self.coat
+            water = shading.specular_of_even_light(cos_o, torch.full_like(share, smooth), shading.F0_WATER)
+            share = share + weight * water
+        return share
+
+    def glossy_albedo(self, roughness: Tensor) -> Tensor:
+        """Share of light from all around that they send back in all, [N]: 2·∫gloss(cos)·cos d cos."""
+        nodes, weights = np.polynomial.legendre.leggauss(8)
+        cos, weights = (torch.from_numpy(x).to(roughness.dtype) for x in ((nodes + 1) / 2, weights))
+        return (self.gloss(cos, roughness[..., None]) * cos * weights).sum(dim=-1)
 
 
 @dataclass(frozen=True)

@@ -143,14 +143,6 @@ def specular_of_even_light(cos_o: Tensor, roughness: Tensor, f0: float) -> Tenso
     return f0 * scale + bias
 
 
-def specular_albedo(roughness: Tensor, f0: float) -> Tensor:
-    """Share of light from all around that the white GGX lobe sends back in all, [N]: 2·∫ρ(cos)·cos d cos."""
-    nodes, weights = np.polynomial.legendre.leggauss(8)
-    cos = torch.from_numpy((nodes + 1) / 2).to(roughness.dtype)
-    share = specular_of_even_light(cos, roughness[..., None], f0)
-    return (share * cos * torch.from_numpy(weights).to(roughness.dtype)).sum(dim=-1)
-
-
 def respond(radiance: Tensor, gamma: float | Tensor) -> Tensor:
     """Camera response C = x^γ of radiance x ≥ 0, shifted so that C(0) = 0 with the slope that x^γ has at
     RADIANCE_MIN.

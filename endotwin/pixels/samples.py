@@ -134,11 +134,12 @@ class Samples:
         share = self.barycentric.numpy()
         return unit(np.einsum("nk,nka,nab->nb", share, corners, self.rotation, optimize=True))
 
-    def lit(self, n: float, q: float, log_scale: float = 0.0) -> Lit:
-        """What lights the pixels, where the light's n and q and the albedo's scale say what is bounced."""
+    def lit(self, n: float, q: float, log_scale: float = 0.0, gamma: float = 0.0) -> Lit:
+        """What lights the pixels, where the light's n and q, the albedo's scale and γ say what is bounced."""
         more = {"log_exposure": self.log_exposure}
         if self.bounce is not None:
-            more |= {"irradiance": self.bounce.irradiance(n, q, log_scale), "gloss": self.bounce.gloss}
+            irradiance = self.bounce.irradiance(n, q, log_scale, gamma)
+            more |= {"irradiance": irradiance, "gloss": self.bounce.gloss}
         if self.guides is not None:
             return Lit(self.cos, self.guides, **more)
         return Lit.at_lens(self.cos, self.sin2, self.log_cos_axis, self.log_distance, **more)

@@ -11,7 +11,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from endotwin.light import shading
 from endotwin.light.bounced import Albedo, BouncedLight, Places
 from endotwin.light.film import film_in_view
 from endotwin.light.forward import Lit, Lobes, radiance
@@ -139,7 +138,7 @@ class ViewLight:
         and metallic of the hits, [N, 5]."""
         twin, roughness = self.twin, material[:, 3]
         if self.irradiance is not None:
-            gloss = shading.specular_of_even_light(lit.cos_o.clamp(max=1), roughness, twin.materials.f0)
+            gloss = _lobes(twin).gloss(lit.cos_o.clamp(max=1), roughness)
             bounced = torch.from_numpy(hits.interpolate(twin.surface, self.irradiance))
             lit = replace(lit, irradiance=bounced, gloss=gloss)
         base_color = material[:, :3] * (1 - material[:, 4:])
@@ -164,4 +163,4 @@ def _albedo(twin: Twin, radiosity: Radiosity) -> np.ndarray:
     materials = twin.materials
     diffuse = torch.from_numpy(materials.base_color * (1 - materials.metallic)[:, None])
     roughness = torch.from_numpy(materials.roughness)
-    return Albedo.of(radiosity, diffuse, roughness, materials.f0, twin.surface.triangles).scaled(0.0)
+    return Albedo.of(radiosity, diffuse, roughness, _lobes(twin), twin.surface.triangles).scaled(0.0)

@@ -7,8 +7,9 @@ from typing import Self
 
 
 class Rows:
-    """Base of a dataclass all of whose fields are arrays or tensors of as many rows."""
+    """Base of a dataclass all of whose fields are arrays or tensors of as many rows, or None."""
 
     def __getitem__(self, index) -> Self:
         """Those that ``index`` names: numbers [M], bool [N], or a slice."""
-        return type(self)(*(getattr(self, field.name)[index] for field in fields(self)))
+        values = (getattr(self, field.name) for field in fields(self))
+        return type(self)(*(None if value is None else value[index] for value in values))
