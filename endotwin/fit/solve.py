@@ -59,7 +59,7 @@ LIGHT_COARSEST_MM = 12.0
 """Cells of the features beside which light and response are found, in units of the scene."""
 
 LIGHT_PIXELS, LIGHT_STEPS = 400_000, 6
-HOLD_STEPS, BOUNCE_STEPS = 1, 9
+HOLD_STEPS, BOUNCE_STEPS = 1, 10
 """Steps where light is bounced, and depends on the materials; before HOLD_STEPS the albedo's scale is
 held."""
 
@@ -90,7 +90,7 @@ CERTAIN_NORMAL_DEG = 5.0
 """A triangle whose vertex normals differ by more bends too much for its normal to be certain."""
 
 CONVERGED = 2e-4
-"""A step that lowers the cost by a smaller share than this is the last."""
+"""A step that changes the cost by a smaller share than this is the last."""
 
 
 @dataclass(frozen=True)
@@ -261,8 +261,6 @@ def _find_light(
         late = pace.left(LIGHT) <= 2 * step_s
         if late and (relighting.bounces or number):
             break
-        if relighting.bounces and too_dark(state):
-            state, steps = relighting.without_bounce(solver, state), number + LIGHT_STEPS
         within = Within.of(solver.samples, surface, unit)
         material = at_pixels(solver.samples, solver.triangles, state.materials)
         shared, noise = state.shared, solver.noise(state)
@@ -285,10 +283,12 @@ def _find_light(
             break
         state, gain = _stepped(solver, state, relighting, joint=relighting.bounces)
         number += 1
-        if relighting.bounces and number > coat_step:
+        if relighting.bounces and too_dark(state):
+            state, steps = relighting.without_bounce(solver, state), number + LIGHT_STEPS
+        elif relighting.bounces and number > coat_step:
             best = _better(best, solver, state)
         pace.report("find the light", number, steps)
-        if gain < CONVERGED * solver.cost(state, solver.noise(state)):
+        if abs(gain) < CONVERGED * solver.cost(state, solver.noise(state)):
             number = max(number, coat_step) if judged is None else steps
     if relighting.bounces and best is not None:
         state = best.state
@@ -315,7 +315,7 @@ def _better(best: _Best | None, solver: GaussNewton, state: State) -> _Best:
 
 def _stepped(solver: GaussNewton, state: State, relighting: Relighting, joint: bool) -> tuple[State, float]:
     """A step of ``solver``, of the materials alone where a ``joint`` one finds nothing lower, with the
-    samples relit by what it has found; and by how much the cost fell.
+    samples relit by what it has found; and by how much the cost fell (below 0: it rose).
 
     A step knows what it does to bounced light to first order. Where that was too far, it goes half the way.
     """
@@ -338,7 +338,7 @@ def _stepped(solver: GaussNewton, state: State, relighting: Relighting, joint: b
         if after <= WORSE * before or halving == HALVINGS:
             break
         moved = halfway(state, moved)
-    return moved, max(before - after, 0.0)
+    return moved, before - after
 
 
 def _find_detail(

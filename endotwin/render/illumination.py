@@ -39,7 +39,7 @@ class Illumination:
             cell_mm = twin.effects["interreflection"].cell_mm
             if self._radiosity is None or self._radiosity.cell_mm != cell_mm:
                 self._radiosity = Radiosity(twin.surface, caster, cell_mm)
-            elif before.twin.materials is twin.materials:
+            elif before.twin.materials is twin.materials and _lobes(before.twin) == _lobes(twin):
                 self._albedo = before._albedo
             if self._albedo is None:
                 self._albedo = _albedo(twin, self._radiosity)
