@@ -14,6 +14,8 @@ import scipy.sparse
 import torch
 from torch import Tensor
 
+from endotwin.fit.hashgrid import to_torch
+
 RIDGE = 1e-6
 """Share of the largest entry of D that is added to all: a black frame's gain stays."""
 
@@ -73,9 +75,7 @@ class FrameSums:
         inverse, columns = (
             torch.from_numpy(x).float().to(device) for x in (1 / diagonal, self._columns[:, 1:])
         )
-        return FrameBorder(
-            _sparse(coupling).to(device), _sparse(coupling.T.tocsr()).to(device), inverse, columns
-        )
+        return FrameBorder(to_torch(coupling).to(device), to_torch(coupling.T).to(device), inverse, columns)
 
 
 @dataclass(frozen=True)
@@ -117,10 +117,3 @@ class FrameBorder:
         beside = torch.from_numpy(np.r_[1.0, -shared]).to(self.columns)
         left = self.columns @ beside - (self.adjoint @ vertex.reshape(-1, 1))[:, 0]
         return self.solve(left[:, None])[:, 0].double().cpu().numpy()
-
-
-def _sparse(matrix: scipy.sparse.csr_array) -> Tensor:
-    pointers, indices = (torch.from_numpy(x.astype(np.int32)) for x in (matrix.indptr, matrix.indices))
-    return torch.sparse_csr_tensor(
-        pointers, indices, torch.from_numpy(matrix.data), matrix.shape, check_invariants=False
-    )

@@ -252,7 +252,6 @@ class GaussNewton:
             self._frames if gains else None,
         )
         free = free_directions(state.shared, self.held) if joint else np.zeros((len(state.shared.vector), 0))
-        before = self._cost(state, noise)
         damping = len(self.samples) * scale * DAMPING**2 if state.shared.bounces else 0.0
         table_step, shared_step = self._solve(state, equations, scale, free, damping)
         room = room_below_furnace(state, float(shared_step[-1])) if joint and state.shared.bounces else 1.0
@@ -268,6 +267,7 @@ class GaussNewton:
             vertex_step = state.link_slope * self._operator(table_step)
             gain_step = equations.gains.step(vertex_step, shared_step.numpy())
             trusted = min(trusted, MOST_GAIN_STEP / max(float(np.abs(gain_step).max()), 1e-12))
+        before = self._cost(state, noise)
         for length in (min(1.0, room, trusted) * each for each in LENGTHS):
             moved = replace(
                 state,
