@@ -339,3 +339,8 @@ def test_points_in_the_image_are_triangulated_as_qhull_does(seed, pixels, others
     assert (twice_area < 0).all()
     assert twice_area.sum() == pytest.approx(-2 * 31**2, rel=1e-6)
     assert len(twice_area) == len(Delaunay(np.unique(uv, axis=0)).simplices)
+
+
+@pytest.mark.parametrize("uv", [[[3, 3]], [[3, 3], [5, 3]], [[3, 3], [4, 4], [5, 5], [6, 6]]])
+def test_points_in_line_have_no_triangles(uv):
+    assert _delaunay(np.array(uv, float)).shape == (0, 3)

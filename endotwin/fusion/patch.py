@@ -205,7 +205,8 @@ def _delaunay(uv: np.ndarray) -> np.ndarray:
     width, height = np.ceil(uv.max(axis=0)).astype(int) + 2
     plane = cv2.Subdiv2D((-1, -1, int(width) + 1, int(height) + 1))
     plane.insert(uv.tolist())
-    found = np.ascontiguousarray(plane.getTriangleList().reshape(-1, 3, 2)[:, ::-1]).view(np.int64)[..., 0]
+    triangles = np.array(plane.getTriangleList(), np.float32).reshape(-1, 3, 2)  # () where all are in line
+    found = np.ascontiguousarray(triangles[:, ::-1]).view(np.int64)[..., 0]
     bits = np.ascontiguousarray(uv).view(np.int64)[:, 0]
     order = np.argsort(bits, kind="stable")
     place = np.minimum(np.searchsorted(bits[order], found), len(bits) - 1)
