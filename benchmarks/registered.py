@@ -3,7 +3,8 @@
     python benchmarks/registered.py DATA/colon_direct --mesh DATA/colon_direct/truth/colon.ply --scale 0.5
 
 As C3VD is made: photos stay, poses err as a model put into the recorder's frame by hand errs, and depth is of
-the true surface at the erring poses. In the last row depth was taken with the photo, and errs with it. Sizes
+the true surface at the erring poses through the erring calibration. In the row before the last depth was
+taken with the photo, and errs with it. Sizes
 are exact for motions that all frames share, and root mean squares for those of each.
 
 Columns: PSNR of the whole and the covered part of held-out photos, as written and aligned; γ of the aligned
@@ -43,7 +44,8 @@ Size = tuple[float, float]
 @dataclass(frozen=True)
 class Wrong:
     """One motion of the ``model`` about the scene, one of the camera on the ``hand``, a clock's ``lag`` in
-    frames, a smooth ``drift`` and a ``jitter`` of each frame; ``depth_too``: it was taken with the photo."""
+    frames, a smooth ``drift`` and a ``jitter`` of each frame; ``depth_too``: it was taken with the photo.
+    ``intrinsics`` put the written calibration right (see ``Camera.corrected``)."""
 
     model: Size = (0.0, 0.0)
     hand: Size = (0.0, 0.0)
@@ -51,6 +53,7 @@ class Wrong:
     drift: Size = (0.0, 0.0)
     jitter: Size = (0.0, 0.0)
     depth_too: bool = False
+    intrinsics: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     def poses(self, T_world_camera: np.ndarray, seed: int) -> np.ndarray:
         """What is written [N, 4, 4] where the camera was at ``T_world_camera`` [N, 4, 4]."""
@@ -73,6 +76,7 @@ WRONG = {
     "depth moves with its photo, .3 mm/.15°, mostly drift": Wrong(
         drift=(0.29, 0.145), jitter=(0.08, 0.04), depth_too=True
     ),
+    "focal length .5 % short, centre .4 % of the width aside": Wrong(intrinsics=(0.005, 0.004, -0.002)),
 }
 
 
@@ -90,7 +94,8 @@ def _motions(twists: np.ndarray, size: Size) -> np.ndarray:
 def written(sequence: Sequence, wrong: Wrong, caster: Caster, folder: Path, seed: int) -> Path:
     """``sequence`` as ``wrong`` poses write it down, as C3VD v1 in ``folder``, which is returned."""
     folder.mkdir()
-    camera, poses = sequence.camera, wrong.poses(sequence.T_world_camera, seed)
+    camera = sequence.camera.corrected(-np.array(wrong.intrinsics))
+    poses = wrong.poses(sequence.T_world_camera, seed)
     forward = camera.pixel_directions[..., 2]
     for index, pose in enumerate(poses):
         depth_mm = np.nan_to_num(sequence.depth_mm(index))

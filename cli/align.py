@@ -29,6 +29,12 @@ def align(
             metavar="FILE", help="Write the corrected poses of all frames, in the sequence's own format."
         ),
     ] = None,
+    camera: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE", help="Write the photos' camera, whose calibration may have been put right."
+        ),
+    ] = None,
     against: Annotated[
         Path | None,
         typer.Option(metavar="TRAJECTORY", help="Print ATE and RPE against true poses, one a frame."),
@@ -48,24 +54,25 @@ def align(
 ) -> None:
     """Align the photos to TWIN's surface, where what is known of registration errors explains them.
 
-    The model's place, the hand-eye matrix, the clock's lag, then a drift: each is kept only if photos that
-    did not choose it gain. 'endotwin fit' does the same unless told otherwise.
+    The model's place, the hand-eye matrix, the clock's lag, the calibration, then a drift: each is kept only
+    if photos that did not choose it gain. 'endotwin fit' does the same unless told otherwise.
 
     Example: endotwin align twin --poses corrected.txt
     """
-    for path, mark in ((output, TWIN), (poses, None)):
+    for path, mark in ((output, TWIN), (poses, None), (camera, None)):
         if path is not None:
             check_free(path, overwrite, mark)
     with console.command("align", profile) as run:
         with run.stage("import"):
             from endotwin.align.trajectory import compare
-            from endotwin.align.written import write_poses
+            from endotwin.align.written import write_camera, write_poses
             from endotwin.pipeline import align_twin
             from endotwin.sequence.poses import read_poses
             from endotwin.twin import Twin
         with run.stage("load"):
             twin = Twin.load(twin_folder)
-            _check_own_poses(poses, Path(twin.source.path))
+            for path in filter(None, (poses, camera)):
+                _check_not_read(path, Path(twin.source.path))
             true = None if against is None else read_poses(against)[0]
         if twin.fitted and output is None and not overwrite:
             raise OutputError(
@@ -82,14 +89,16 @@ def align(
             aligned.save(output or twin_folder, overwrite=True)
             if poses is not None:
                 write_poses(poses, sequence, overwrite)
+            if camera is not None:
+                write_camera(camera, aligned.at_scale(1.0).camera, overwrite)
     print("\n".join(lines))
-    print("wrote", " and ".join(map(str, filter(None, (output or twin_folder, poses)))))
+    print("wrote", " and ".join(map(str, filter(None, (output or twin_folder, poses, camera)))))
 
 
-def _check_own_poses(poses: Path | None, sequence: Path) -> None:
-    """Raise OutputError if ``poses`` is a file of the sequence, which would then be aligned twice."""
+def _check_not_read(path: Path, sequence: Path) -> None:
+    """Raise OutputError if ``path`` is a file of the sequence, which would then be corrected twice."""
     folder = sequence.parent if sequence.is_file() else sequence
-    if poses is not None and poses.exists() and poses.resolve().is_relative_to(folder.resolve()):
+    if path.exists() and path.resolve().is_relative_to(folder.resolve()):
         raise OutputError(
-            f"{poses} belongs to the sequence {sequence}, which the twin reads again; choose another name"
+            f"{path} belongs to the sequence {sequence}, which the twin reads again; choose another name"
         )

@@ -17,7 +17,8 @@ from endotwin.align.photos import read_photos
 from endotwin.align.scene import SHADING_MEAN, Scene
 from endotwin.align.texture import sighted
 from endotwin.align.trajectory import compare
-from endotwin.align.written import write_poses
+from endotwin.align.written import write_camera, write_poses
+from endotwin.cameras import read_camera
 from endotwin.errors import SequenceError, TrajectoryError
 from endotwin.sequence.poses import read_c3vd_poses, read_poses, write_c3vd_poses
 from endotwin.surface.casting import Caster
@@ -49,19 +50,20 @@ def test_the_adjoint_carries_a_twist_from_one_side_of_a_pose_to_the_other():
 
 def test_slopes_of_corrections_are_those_of_finite_differences():
     start = Corrections.none(tube_sequence.poses(6))
-    start = replace(
-        start, shared=np.r_[some_twists(2, 0.01, 0.01).ravel(), 0.2], own=some_twists(6, 0.01, 0.01, 1)
-    )
+    shared = np.r_[some_twists(2, 0.01, 0.01).ravel(), 0.2, 0.01, -0.01, 0.02]
+    start = replace(start, shared=shared, own=some_twists(6, 0.01, 0.01, 1))
     slopes = start.slopes()
     for k in range(SHARED):
         bent = replace(start, shared=start.shared + 1e-4 * np.eye(SHARED)[k])
-        found = twists_between(start.poses, bent.poses) / 1e-4
+        turned = twists_between(start.poses, bent.poses) / 1e-4
+        lens = np.tile((bent.intrinsics - start.intrinsics) / 1e-4, (6, 1))
+        found = np.hstack([turned, lens])
         np.testing.assert_allclose(slopes[:, :, k], found, atol=0.01 * np.abs(found).max() + 1e-3)
 
 
 def test_a_lag_of_a_whole_frame_is_the_next_pose():
     T = tube_sequence.poses(6)
-    later = replace(Corrections.none(T), shared=np.r_[np.zeros(12), 1.0]).poses
+    later = replace(Corrections.none(T), shared=np.r_[np.zeros(12), 1.0, np.zeros(3)]).poses
     np.testing.assert_allclose(later[:-1], T[1:], atol=1e-9)
 
 
@@ -72,7 +74,7 @@ def test_turns_that_a_recorder_read_between_two_frames_come_back(lag):
     read = Slerp(np.arange(12), turns)(np.clip(np.arange(12) + lag, 0, 11))
     written = T.copy()
     written[:, :3, :3] = read.as_matrix()
-    found = replace(Corrections.none(written), shared=np.r_[np.zeros(12), -lag]).poses
+    found = replace(Corrections.none(written), shared=np.r_[np.zeros(12), -lag, np.zeros(3)]).poses
     off = (Rotation.from_matrix(found[:, :3, :3]).inv() * turns).magnitude()[4:-4]
     was = (read.inv() * turns).magnitude()[4:-4]
     assert off.max() < 0.1 * was.max()
@@ -83,8 +85,12 @@ def test_slopes_of_sighted_vertices_are_those_of_finite_differences(tube):
     scene = Scene.of(Caster(tube.surface), sequence.camera, 4000)
     photo, pose = read_photos(sequence, [frame])[frame], sequence.T_world_camera[frame]
     light = SHADING_MEAN
-    for k, size in enumerate((3e-4, 3e-4, 3e-4, 0.01, 0.01, 0.01)):
-        ends = [sighted(scene, photo, moved(pose, sign * size * np.eye(6)[k]), 2.0) for sign in (-1, 0, 1)]
+    for k, size in enumerate((3e-4, 3e-4, 3e-4, 0.01, 0.01, 0.01, 5e-4, 5e-4, 5e-4)):
+        bent = [sign * size * np.eye(9)[k] for sign in (-1, 0, 1)]
+        ends = [
+            sighted(scene.through(scene.camera.corrected(by[6:])), photo, moved(pose, by[:6]), 2.0)
+            for by in bent
+        ]
         common = set.intersection(*(set(end.vertex.tolist()) for end in ends))
         rows = [np.flatnonzero(np.isin(end.vertex, list(common))) for end in ends]
         low, high = (
@@ -125,13 +131,16 @@ def test_trajectories_of_other_lengths_are_not_compared():
 
 def test_a_twin_keeps_where_its_photos_were_aligned_to(tube, tmp_path):
     twists = some_twists(6, 0.1, 0.1)
-    aligned = replace(tube, registration=Registration(tuple(map(tuple, twists.tolist())), {"model_mm": 0.1}))
+    rows = tuple(map(tuple, twists.tolist()))
+    aligned = replace(tube, registration=Registration(rows, {"model_mm": 0.1}, intrinsics=(0.01, 0.0, 0.02)))
     aligned.save(tmp_path / "twin")
     back = Twin.load(tmp_path / "twin")
     written = tube.sequence().T_world_camera
     assert back.registration == aligned.registration
     np.testing.assert_array_equal(back.sequence().T_world_camera, aligned.sequence().T_world_camera)
     np.testing.assert_allclose(twists_between(written, back.sequence().T_world_camera), twists, atol=1e-12)
+    assert back.sequence().camera == tube.camera.corrected(np.array([0.01, 0.0, 0.02]))
+    assert back.at_scale(0.5).camera == tube.at_scale(0.5).camera.corrected(np.array([0.01, 0.0, 0.02]))
 
 
 def test_a_sequence_that_grew_since_is_told(tube):
@@ -147,35 +156,36 @@ def test_corrected_poses_are_read_back(tube, tmp_path, format):
     np.testing.assert_allclose(read_poses(tmp_path / "poses.txt")[0], sequence.T_world_camera, atol=1e-9)
 
 
-def hand_eye_error(twin: Twin, example: Path, folder: Path, twist: np.ndarray) -> np.ndarray:
-    """The example's photos beside depth of its surface at other poses, which a wrong hand-eye matrix
-    gives."""
+def registered_wrongly(twin: Twin, folder: Path, twist: np.ndarray, intrinsics: np.ndarray) -> np.ndarray:
+    """The example's photos beside depth of its surface at other poses, which a wrong hand-eye matrix gives,
+    and through a wrong camera: what puts them right is ``twist`` [6] and ``intrinsics`` [3]."""
     import cv2
     import tifffile
 
     from endotwin.surface.casting import Caster
 
     sequence, caster = twin.sequence(), Caster(twin.surface)
+    camera = sequence.camera.corrected(-intrinsics)
     true = sequence.T_world_camera
     written = moved(true, -twist)
     folder.mkdir()
-    rays = sequence.camera.pixel_directions
+    rays = camera.pixel_directions
     for index in range(len(sequence)):
-        hits = caster.cast(sequence.camera, written[index])
+        hits = caster.cast(camera, written[index])
         depth_mm = np.zeros(rays.shape[:2], np.float32).reshape(-1)
         depth_mm[hits.pixel] = hits.distance_mm * rays.reshape(-1, 3)[hits.pixel, 2]
         raw = np.uint16(np.clip(depth_mm / 100 * 65535, 0, 65535) + 0.5).reshape(rays.shape[:2])
         tifffile.imwrite(folder / f"{index:04d}_depth.tiff", raw)
         cv2.imwrite(str(folder / f"{index:04d}_color.png"), sequence.color(index)[..., ::-1])
-    (folder / "camera.json").write_bytes((example / "camera.json").read_bytes())
+    write_camera(folder / "camera.json", camera)
     write_c3vd_poses(folder / "pose.txt", written)
     return true
 
 
 @pytest.mark.slow
-def test_a_hand_eye_error_is_found_and_held_out_photos_gain(fused, example, tmp_path, capsys):
+def test_a_hand_eye_error_is_found_and_held_out_photos_gain(fused, tmp_path, capsys):
     twist = np.r_[np.radians([0.1, -0.1, 0.07]), 0.2, -0.2, 0.15]
-    true = hand_eye_error(fused(), example, tmp_path / "spoilt", twist)
+    true = registered_wrongly(fused(), tmp_path / "spoilt", twist, np.zeros(3))
     write_c3vd_poses(tmp_path / "true.txt", true)
     assert invoke("fuse", tmp_path / "spoilt", "-o", tmp_path / "twin") == 0
     plain = endotwin.evaluate(endotwin.fit_twin(tmp_path / "twin", align="off"))
@@ -191,6 +201,17 @@ def test_a_hand_eye_error_is_found_and_held_out_photos_gain(fused, example, tmp_
     assert found.ate_mm < before.ate_mm / 2
     aligned = endotwin.evaluate(endotwin.fit_twin(tmp_path / "twin"))
     assert aligned.psnr_covered > plain.psnr_covered + 2
+
+
+@pytest.mark.slow
+def test_a_calibration_that_is_not_the_photos_is_put_right(fused, tmp_path):
+    twin = fused()
+    registered_wrongly(twin, tmp_path / "spoilt", np.zeros(6), np.array([0.01, 0.005, 0.0]))
+    assert invoke("fuse", tmp_path / "spoilt", "-o", tmp_path / "twin") == 0
+    assert invoke("align", tmp_path / "twin", "--camera", tmp_path / "camera.json") == 0
+    found, true = read_camera(tmp_path / "camera.json"), twin.camera
+    written = read_camera(tmp_path / "spoilt" / "camera.json")
+    assert abs(found.fx - true.fx) < 0.5 * abs(written.fx - true.fx)
 
 
 @pytest.mark.slow

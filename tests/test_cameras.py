@@ -102,6 +102,13 @@ def test_a_scaled_camera_sees_the_same_rays(camera, scale):
     np.testing.assert_allclose(scaled.directions((uv + 0.5) * ratio - 0.5), camera.directions(uv), atol=1e-8)
 
 
+@pytest.mark.parametrize("camera", ALL, ids=name)
+def test_a_lengthened_camera_shows_the_same_larger_about_its_centre(camera):
+    points, centre = camera.directions(grid(camera)), np.array([camera.cx, camera.cy])
+    shown = camera.lengthened(1.02).project(points)
+    np.testing.assert_allclose(shown - centre, 1.02 * (camera.project(points) - centre), atol=1e-6)
+
+
 def test_a_pinhole_sees_nothing_behind_it():
     assert np.isnan(PLAIN.project(np.array([[0.1, 0.2, -1.0], [0.1, 0.2, 0.0]]))).all()
 

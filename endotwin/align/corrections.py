@@ -1,11 +1,10 @@
 """What may be wrong with a sequence's registration, from what all photos share to what each has of its own.
 
 A robot's poses meet a model through one placement of the model (6 numbers), one hand-eye matrix (6) and one
-lag
-of the clock: T(t) = M · T_written(t + lag) · X (Bobrow et al. 2023 register C3VD so). What is left drifts
-slowly,
-and a little differs from photo to photo: a Gaussian process along time, of which photos that have no say get
-what is smooth.
+lag of the clock: T(t) = M · T_written(t + lag) · X (Bobrow et al. 2023 register C3VD so). The calibration
+that depth was rendered with may not be that of the photos: focal length and centre (3). What is left drifts
+slowly, and a little differs from photo to photo: a Gaussian process along time, of which photos that have no
+say get what is smooth.
 """
 
 from __future__ import annotations
@@ -16,12 +15,19 @@ import numpy as np
 
 from endotwin.align.motion import Path, adjoint, moved, twists_between
 
-SHARED = 13
-"""Model, hand-eye, lag."""
+PLACED, SHARED = 13, 16
+"""Model, hand-eye, lag; and intrinsics beside them."""
+
+OF_PHOTO = 9
+"""What moves a photo's picture: its camera's twist and its intrinsics."""
 
 SPREAD_MM, SPREAD_DEG, SPREAD_LAG = 0.3, 0.2, 0.3
 """Standard deviation of each number of the model's place and of the hand-eye matrix (C3VD: .32 mm and .16° in
 all), and of the lag in frames."""
+
+SPREAD_FOCAL, SPREAD_CENTRE = 0.005, 0.004
+"""The same of a focal length, of itself, and of a centre, of the width: calibrations of one C3VD scope differ
+by 3 to 6 px of 1350."""
 
 OWN_MM, OWN_DEG = 0.1, 0.06
 """Standard deviation, in each direction, of what a photo has of its own."""
@@ -38,7 +44,8 @@ class Corrections:
 
     Attributes:
         path: through the written poses. centre_mm: float64 [3], about which the model turns.
-        shared: float64 [13]: twist of the model, twist of the hand-eye matrix, lag in frames.
+        shared: float64 [16]: twist of the model, twist of the hand-eye matrix, lag in frames, intrinsics (see
+            ``Camera.corrected``).
         own: float64 [N, 6], twist of each photo.
     """
 
@@ -63,6 +70,11 @@ class Corrections:
         """The corrections in each camera's frame, float64 [N, 6]."""
         return twists_between(self.path.T_world_camera, self.poses)
 
+    @property
+    def intrinsics(self) -> np.ndarray:
+        """What is wrong with the photos' camera, float64 [3] (see ``Camera.corrected``)."""
+        return self.shared[PLACED:]
+
     def _poses(self, lag: float) -> np.ndarray:
         placed = self.path.later(lag)
         placed[:, :3, 3] -= self.centre_mm
@@ -72,17 +84,20 @@ class Corrections:
         return moved(placed, self.own)
 
     def slopes(self) -> np.ndarray:
-        """Twist of each camera by each shared number, float64 [N, 6, 13], to first order."""
+        """Twist and intrinsics of each photo by each shared number, float64 [N, 9, 16], to first order."""
         T = self.poses
         T[:, :3, 3] -= self.centre_mm
         by_model = adjoint(np.linalg.inv(T))
         by_hand_eye = adjoint(np.linalg.inv(moved(np.tile(np.eye(4), (len(T), 1, 1)), self.own)))
         lag = self.shared[12]
         by_lag = twists_between(self._poses(lag - LAG_STEP), self._poses(lag + LAG_STEP)) / (2 * LAG_STEP)
-        return np.concatenate([by_model, by_hand_eye, by_lag[:, :, None]], axis=2)
+        found = np.zeros((len(T), OF_PHOTO, SHARED))
+        found[:, :6, :PLACED] = np.concatenate([by_model, by_hand_eye, by_lag[:, :, None]], axis=2)
+        found[:, 6:, PLACED:] = np.eye(3)
+        return found
 
     def stepped(self, shared: np.ndarray, own: np.ndarray, frames: np.ndarray) -> Corrections:
-        """With ``shared`` [13] and ``own`` [F, 6] of ``frames`` [F] added; photos between follow the
+        """With ``shared`` [16] and ``own`` [F, 6] of ``frames`` [F] added; photos between follow the
         drift."""
         told = self.own[frames] + own
         times = np.arange(len(self.own))
@@ -96,9 +111,9 @@ class Corrections:
 
 
 def shared_spread() -> np.ndarray:
-    """Prior standard deviations of the shared numbers, [13]."""
+    """Prior standard deviations of the shared numbers, [16]."""
     one = np.r_[np.full(3, np.radians(SPREAD_DEG)), np.full(3, SPREAD_MM)]
-    return np.r_[one, one, SPREAD_LAG]
+    return np.r_[one, one, SPREAD_LAG, SPREAD_FOCAL, SPREAD_CENTRE, SPREAD_CENTRE]
 
 
 def own_spread() -> np.ndarray:

@@ -55,7 +55,8 @@ class Rim:
     """P pixels beside rims in one photo.
 
     Attributes:
-        residual: float64 [P], ln photo − ln twin. slopes: [P, 6], of it by the camera's twist.
+        residual: float64 [P], ln photo − ln twin. slopes: [P, 9], of it by the camera's twist and
+            intrinsics.
         stretch: int [P], side and stretch of rim, numbered without gaps.
     """
 
@@ -94,11 +95,13 @@ def rim(
 def moving_slopes(
     scene: Scene, predicted: np.ndarray, pixel: np.ndarray, distance_mm: np.ndarray
 ) -> np.ndarray:
-    """Slopes [P, 6], by the camera's twist, of photo − ``predicted`` [H, W] at ``pixel`` [P], whose picture
-    moves with a surface at ``distance_mm`` [P]."""
+    """Slopes [P, 9], by the camera's twist and intrinsics, of photo − ``predicted`` [H, W] at ``pixel`` [P],
+    whose picture moves with a surface at ``distance_mm`` [P]."""
     slopes_uv = [slope.reshape(-1)[pixel].astype(np.float64) for slope in gradient(predicted)]
     points = scene.rays[pixel].astype(np.float64) * distance_mm[:, None]
-    return by_twist(scene.by_point(pixel, *slopes_uv, points), points)
+    uv = np.stack([pixel % scene.shape[1], pixel // scene.shape[1]], axis=1)
+    turned = by_twist(scene.by_point(pixel, *slopes_uv, points), points)
+    return np.hstack([turned, scene.by_intrinsics(uv, *slopes_uv)])
 
 
 def least_within(distances: np.ndarray, reach: int) -> np.ndarray:

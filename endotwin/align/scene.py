@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -49,6 +49,12 @@ class Scene:
         points, normals = (x[seen].astype(np.float64) for x in (surface.vertices_mm, surface.normals))
         return cls(surface, camera, caster, _by_direction(camera), seen, points, normals)
 
+    def through(self, camera: Camera) -> Scene:
+        """The same surface before another camera."""
+        if camera == self.camera:
+            return self
+        return replace(self, camera=camera, pixels_by_direction=_by_direction(camera))
+
     @property
     def shape(self) -> tuple[int, int]:
         return self.camera.height, self.camera.width
@@ -72,6 +78,12 @@ class Scene:
         by_u, by_v = self.pixels_by_direction[pixel].astype(np.float64).transpose(1, 0, 2)
         by_ray = slope_u[:, None] * by_u + slope_v[:, None] * by_v
         return (by_ray - (by_ray * ray).sum(axis=1, keepdims=True) * ray) / distance_mm
+
+    def by_intrinsics(self, uv: np.ndarray, slope_u: np.ndarray, slope_v: np.ndarray) -> np.ndarray:
+        """Slopes [N, 3] by the camera's intrinsics (see ``Camera.corrected``) of what has ``slope_u``,
+        ``slope_v`` [N] a pixel at pixels [N, 2]."""
+        longer = slope_u * (uv[:, 0] - self.camera.cx) + slope_v * (uv[:, 1] - self.camera.cy)
+        return np.stack([longer, slope_u * self.camera.width, slope_v * self.camera.width], axis=1)
 
     def squared_radius(self, uv: np.ndarray) -> np.ndarray:
         """r² of pixels [N, 2], r = 1 at half the width from the middle."""

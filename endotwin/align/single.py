@@ -50,7 +50,7 @@ def placed(
             return T_world_camera
         reach = int(np.ceil(BAND_SIGMAS * sigma_px))
         nearest_mm = least_within(distances, reach).reshape(-1)[pixel].astype(np.float64)
-        slopes = moving_slopes(scene, predicted, pixel, nearest_mm)
+        slopes = moving_slopes(scene, predicted, pixel, nearest_mm)[:, :6]
         left = (shown - predicted).reshape(-1)[pixel].astype(np.float64)
         left -= np.median(left)
         width = max(1.4826 * float(np.median(np.abs(left))), 1e-3)

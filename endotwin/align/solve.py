@@ -8,7 +8,15 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.linalg
 
-from endotwin.align.corrections import SHARED, Corrections, own_covariance, own_spread, shared_spread
+from endotwin.align.corrections import (
+    OF_PHOTO,
+    PLACED,
+    SHARED,
+    Corrections,
+    own_covariance,
+    own_spread,
+    shared_spread,
+)
 from endotwin.align.photos import Photo
 from endotwin.align.rims import Paint, Rim, rim
 from endotwin.align.scene import Scene
@@ -23,7 +31,7 @@ rims."""
 
 @dataclass(frozen=True, eq=False)
 class Looked:
-    """What F photos tell at one state of the corrections: matrix [F, 6, F, 6] and right-hand side [F, 6]; and
+    """What F photos tell at one state of the corrections: matrix [F, 9, F, 9] and right-hand side [F, 9]; and
     the terms that they came from."""
 
     matrix: np.ndarray
@@ -58,9 +66,10 @@ def look(
 
 
 def rim_equations(seen: Rim) -> tuple[np.ndarray, np.ndarray]:
-    """Matrix [6, 6] and right-hand side [6] of a photo's twist, in units of the residuals' variance."""
+    """Matrix [9, 9] and right-hand side [9] of a photo's twist and intrinsics, in units of the residuals'
+    variance."""
     if len(seen.residual) < 100:
-        return np.zeros((6, 6)), np.zeros(6)
+        return np.zeros((OF_PHOTO, OF_PHOTO)), np.zeros(OF_PHOTO)
     left, weight, width = even(seen)
     total = np.bincount(seen.stretch, weight)
     slopes = seen.slopes - np.stack(
@@ -81,23 +90,20 @@ def even(seen: Rim) -> tuple[np.ndarray, np.ndarray, float]:
     return left, weight, width
 
 
-def step(now: Corrections, told: Looked, frames: np.ndarray, own: bool) -> tuple[Corrections, np.ndarray]:
-    """The corrections after a Gauss–Newton step, and the standard deviations of the shared ones [13]; what
-    the photos of ``frames`` [F] have of their own moves if ``own`` says so."""
-    count = len(frames)
-    flat = told.matrix.reshape(6 * count, 6 * count)
-    shared = now.slopes()[frames].reshape(6 * count, SHARED)
-    to_twists = np.hstack([shared, np.eye(6 * count)]) if own else shared
-    precision = np.diag(1 / shared_spread() ** 2)
-    before = now.shared
+def step(now: Corrections, told: Looked, frames: np.ndarray, lens: bool, own: bool) -> Corrections:
+    """The corrections after a Gauss–Newton step; intrinsics move if ``lens`` says so, and what the photos of
+    ``frames`` [F] have of their own if ``own`` does."""
+    count, shared = len(frames), SHARED if lens else PLACED
+    flat = told.matrix.reshape(OF_PHOTO * count, OF_PHOTO * count)
+    to_photos = now.slopes()[frames][..., :shared].reshape(OF_PHOTO * count, shared)
+    precision, before = np.diag(1 / shared_spread()[:shared] ** 2), now.shared[:shared]
     if own:
+        to_photos = np.hstack([to_photos, np.kron(np.eye(count), np.eye(OF_PHOTO, 6))])
         kernel = np.linalg.inv(own_covariance(frames))
         precision = scipy.linalg.block_diag(precision, np.kron(kernel, np.diag(1 / own_spread() ** 2)))
         before = np.r_[before, now.own[frames].reshape(-1)]
-    normal = to_twists.T @ flat @ to_twists + precision
-    right = to_twists.T @ told.right.reshape(-1) - precision @ before
-    factor = scipy.linalg.cho_factor(normal)
-    found = scipy.linalg.cho_solve(factor, right)
-    spread = np.sqrt(np.diag(scipy.linalg.cho_solve(factor, np.eye(len(normal))))[:SHARED])
-    moved = found[SHARED:].reshape(count, 6) if own else np.zeros((count, 6))
-    return now.stepped(found[:SHARED], moved, frames), spread
+    normal = to_photos.T @ flat @ to_photos + precision
+    right = to_photos.T @ told.right.reshape(-1) - precision @ before
+    found = scipy.linalg.cho_solve(scipy.linalg.cho_factor(normal), right)
+    moved = found[shared:].reshape(count, 6) if own else np.zeros((count, 6))
+    return now.stepped(np.r_[found[:shared], np.zeros(SHARED - shared)], moved, frames)

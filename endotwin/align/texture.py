@@ -33,7 +33,7 @@ class Sighted:
     Attributes:
         vertex: int [S], ascending, numbered as in the scene. cell: int [S], of the image.
         shown: float64 [S], ln of the photo's display value. by_twist: [S, 6], of ``shown`` by the camera's
-            twist.
+            twist; by_intrinsics: [S, 3], by its intrinsics.
         columns: [S, 6], of the shading. points_mm, normals: [S, 3], camera frame. cos: [S], n·ω.
     """
 
@@ -41,14 +41,16 @@ class Sighted:
     cell: np.ndarray
     shown: np.ndarray
     by_twist: np.ndarray
+    by_intrinsics: np.ndarray
     columns: np.ndarray
     points_mm: np.ndarray
     normals: np.ndarray
     cos: np.ndarray
 
     def slopes(self, light: np.ndarray) -> np.ndarray:
-        """[S, 6]: of ``shown`` less its shading under ``light`` [6], by the camera's twist."""
-        return self.by_twist - shading_slopes(self.points_mm, self.normals, self.cos, light)
+        """[S, 9]: of ``shown`` less its shading under ``light`` [6], by the camera's twist and intrinsics."""
+        shading = shading_slopes(self.points_mm, self.normals, self.cos, light)
+        return np.hstack([self.by_twist - shading, self.by_intrinsics])
 
 
 def sighted(scene: Scene, photo: Photo, T_world_camera: np.ndarray, sigma_px: float) -> Sighted:
@@ -81,7 +83,7 @@ def sighted(scene: Scene, photo: Photo, T_world_camera: np.ndarray, sigma_px: fl
         for image in (shown, *gradient(shown))
     ]
     points, cos = points[rows], cos[rows]
-    by_point = scene.by_point(pixel, sampled[1], sampled[2], points)
+    by_point = scene.by_point(pixel, *sampled[1:], points)
     cell_px = width / LIGHT_CELLS
     u, v = (uv / cell_px).astype(int).T
     columns = shading_columns(
@@ -89,7 +91,7 @@ def sighted(scene: Scene, photo: Photo, T_world_camera: np.ndarray, sigma_px: fl
     )
     return Sighted(
         *(rows, v * (LIGHT_CELLS + 1) + u, sampled[0], by_twist(by_point, points)),
-        *(columns, points, normals[rows], cos),
+        *(scene.by_intrinsics(uv, *sampled[1:]), columns, points, normals[rows], cos),
     )
 
 

@@ -27,7 +27,7 @@ class Within:
     """N sightings in F photos.
 
     Attributes:
-        vertex, photo, cell: int [N]; ``cell`` counts those of all photos. slopes: float32 [N, 6].
+        vertex, photo, cell: int [N]; ``cell`` counts those of all photos. slopes: float32 [N, 9].
         residual: float64 [N], ln photo less shading, vertex and cell. weight: [N], at most 1. width: of the
             residuals. light: [6], coefficients of the shading. log_albedo: [V], of the scene's vertices, NaN
             unseen.
@@ -44,29 +44,30 @@ class Within:
     log_albedo: np.ndarray
 
     def normal_equations(self, count: int) -> tuple[np.ndarray, np.ndarray]:
-        """Matrix [F, 6, F, 6] and right-hand side [F, 6] of the twists of ``count`` photos, in units of the
-        residuals' variance."""
+        """Matrix [F, 9, F, 9] and right-hand side [F, 9] of the twists and intrinsics of ``count`` photos, in
+        units of the residuals' variance."""
         weighted = self.slopes * self.weight[:, None]
-        own = np.zeros((count, 6, 6))
+        width = weighted.shape[1]
+        own = np.zeros((count, width, width))
         right = np.stack([-np.bincount(self.photo, x * self.residual, count) for x in weighted.T], axis=1)
         bounds = np.searchsorted(self.photo, np.arange(count + 1))
         for number, (start, stop) in enumerate(pairwise(bounds)):
             own[number] = weighted[start:stop].T @ self.slopes[start:stop]
-        full = np.zeros((count, 6, count, 6))
+        full = np.zeros((count, width, count, width))
         full[np.arange(count), :, np.arange(count)] = own
-        full = full.reshape(6 * count, 6 * count)
+        full = full.reshape(width * count, width * count)
         total = np.bincount(self.vertex, self.weight, len(self.log_albedo))
         order = np.argsort(self.vertex, kind="stable")
         starts = np.arange(0, len(total), CHUNK)
         edges = np.searchsorted(self.vertex[order], np.r_[starts, len(total)])
         for start, low, high in zip(starts, edges[:-1], edges[1:], strict=True):
             rows = order[low:high]
-            sums = np.zeros((min(CHUNK, len(total) - start), count, 6), np.float32)
+            sums = np.zeros((min(CHUNK, len(total) - start), count, width), np.float32)
             sums[self.vertex[rows] - start, self.photo[rows]] = weighted[rows]
             sums /= np.sqrt(np.maximum(total[start : start + CHUNK], 1e-9))[:, None, None]
             flat = sums.reshape(len(sums), -1)
             full -= flat.T @ flat
-        return full.reshape(count, 6, count, 6) / self.width**2, right / self.width**2
+        return full.reshape(count, width, count, width) / self.width**2, right / self.width**2
 
 
 def within(

@@ -49,6 +49,17 @@ class Camera(ABC):
     def scaled(self, scale: float) -> Camera:
         """The camera of the same view at ``round(scale·width)`` × ``round(scale·height)`` pixels."""
 
+    @abstractmethod
+    def lengthened(self, factor: float) -> Camera:
+        """The camera whose pictures are ``factor`` times as large about its centre, which stays."""
+
+    def corrected(self, intrinsics: np.ndarray) -> Camera:
+        """The camera with ``intrinsics`` [3] put right: ln of the factor on its focal length, and where its
+        centre goes, to the right and down, as shares of the width."""
+        longer, right, down = (float(value) for value in intrinsics)
+        moved = {"cx": self.cx + right * self.width, "cy": self.cy + down * self.width}
+        return dataclasses.replace(self.lengthened(np.exp(longer)), **moved)
+
     @cached_property
     def pixel_directions(self) -> np.ndarray:
         """Unit viewing direction of every pixel centre, float32 [height, width, 3]; NaN where none."""

@@ -65,3 +65,6 @@ class Fisheye(Camera):
 
     def scaled(self, scale: float) -> Fisheye:
         return replace(self, **scaled_lengths(self, scale))
+
+    def lengthened(self, factor: float) -> Fisheye:
+        return replace(self, fx=self.fx * factor, fy=self.fy * factor)

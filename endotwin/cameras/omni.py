@@ -99,10 +99,10 @@ class Omni(Camera):
             height=height,
             cx=scaled_centre(self.cx, ratio_x),
             cy=scaled_centre(self.cy, ratio_y),
-            a0=self.a0 * ratio_y,
-            a2=self.a2 / ratio_y,
-            a3=self.a3 / ratio_y**2,
-            a4=self.a4 / ratio_y**3,
             c=self.c * ratio_x / ratio_y,
             d=self.d * ratio_x / ratio_y,
-        )
+        ).lengthened(ratio_y)
+
+    def lengthened(self, factor: float) -> Omni:
+        a2, a3, a4 = self.a2 / factor, self.a3 / factor**2, self.a4 / factor**3
+        return replace(self, a0=self.a0 * factor, a2=a2, a3=a3, a4=a4)

@@ -95,6 +95,9 @@ class Pinhole(Camera):
     def scaled(self, scale: float) -> Pinhole:
         return replace(self, **scaled_lengths(self, scale))
 
+    def lengthened(self, factor: float) -> Pinhole:
+        return replace(self, fx=self.fx * factor, fy=self.fy * factor)
+
     def _distorted(self, xy: np.ndarray) -> np.ndarray:
         """Distorted normalised coordinates [N, 2] of undistorted ones [N, 2]."""
         return self._distorted_with_slope(xy)[0]

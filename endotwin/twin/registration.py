@@ -1,4 +1,5 @@
-"""Where photos lie beside what their sequence says: corrections that belong to a twin."""
+"""Where photos lie beside what their sequence says, and through which camera: corrections that belong to a
+twin."""
 
 from __future__ import annotations
 
@@ -7,13 +8,14 @@ from dataclasses import asdict, dataclass, field, replace
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
+from endotwin.cameras import Camera
 from endotwin.errors import SequenceError
 from endotwin.sequence import Sequence
 
 
 @dataclass(frozen=True)
 class Registration:
-    """Corrections of the poses that a sequence was written with.
+    """Corrections of the poses and the camera that a sequence was written with.
 
     Attributes:
         twists: one a frame, T_world_camera = T_written · exp(twist): a rotation vector in radians, then a
@@ -21,25 +23,32 @@ class Registration:
         found: what they are made of, by name: ``model_mm``, ``model_deg``, ``hand_eye_mm``, ``hand_eye_deg``,
             ``lag_frames``, and ``own_mm``, ``own_deg``: what photos have of their own, root mean square.
         with_depth: whether depth maps move with their photos, or stay where they are.
+        intrinsics: of the photos' camera (see ``Camera.corrected``); depth keeps the written one.
     """
 
     twists: tuple[tuple[float, ...], ...]
     found: dict[str, float] = field(default_factory=dict)
     with_depth: bool = False
+    intrinsics: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     def poses(self, T_written: np.ndarray) -> np.ndarray:
         """The corrected poses float64 [N, 4, 4] of written ones."""
         return T_written @ RigidTransform.from_exp_coords(np.array(self.twists)).as_matrix()
 
+    def camera(self, written: Camera) -> Camera:
+        """The photos' camera where ``written`` is the sequence's, at any scale."""
+        return written.corrected(np.array(self.intrinsics))
+
     def applied(self, sequence: Sequence) -> Sequence:
-        """The sequence at its corrected poses; raises SequenceError if it has another number of frames by
-        now."""
+        """The sequence at its corrected poses, through its corrected camera; raises SequenceError if it has
+        another number of frames by now."""
         if len(sequence) != len(self.twists):
             raise SequenceError(
                 f"{sequence.path} has {len(sequence)} frames, but {len(self.twists)} were aligned; "
                 "make it again with 'endotwin fuse'"
             )
-        return replace(sequence, T_world_camera=self.poses(sequence.T_world_camera))
+        camera = self.camera(sequence.camera)
+        return replace(sequence, camera=camera, T_world_camera=self.poses(sequence.T_world_camera))
 
     def to_dict(self) -> dict:
         """Plain values, from which ``from_dict`` makes it again."""
@@ -51,4 +60,10 @@ class Registration:
         twists = np.array(values["twists"], np.float64)
         if twists.ndim != 2 or twists.shape[1] != 6 or not np.isfinite(twists).all():
             raise ValueError("its registration has no six numbers a frame")
-        return cls(tuple(map(tuple, twists.tolist())), dict(values["found"]), bool(values["with_depth"]))
+        longer, right, down = (float(value) for value in values.get("intrinsics", (0, 0, 0)))
+        return cls(
+            tuple(map(tuple, twists.tolist())),
+            dict(values["found"]),
+            bool(values["with_depth"]),
+            (longer, right, down),
+        )

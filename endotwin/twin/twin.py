@@ -237,7 +237,9 @@ class Twin:
     def at_scale(self, scale: float) -> Twin:
         """The same twin, seen by its camera with images of another factor of the photos' size."""
         source = replace(self.source, scale=scale)
-        return replace(self, source=source, camera=source.open().camera)
+        written = source.open().camera
+        camera = self.registration.camera(written) if self.registration else written
+        return replace(self, source=source, camera=camera)
 
     def sequence(self) -> Sequence:
         """The sequence that the twin was made from, its photos where they were aligned to; raises
