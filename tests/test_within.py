@@ -85,6 +85,24 @@ def test_tissue_without_a_coat_gets_none_and_one_that_is_forced_on_weighs_nothin
     assert decision.state == "on" and forced.weight < 0.02
 
 
+BRIGHT = Globals.of(Light(360.0, 1.7, 2.2), Response(0.42), f0=0.035)
+
+
+def test_highlights_that_clip_bear_a_coat_out():
+    within, material = photographed(replace(BRIGHT, coat=Coat(0.3, 0.13)))
+    rows = torch.nonzero((within.samples.color < 255).all(dim=1))[:, 0]
+    dull = replace(within, samples=within.samples[rows], vertex=within.vertex[rows.numpy()])
+    _, all_told = judged(within.highlights(material, BRIGHT, NOISE), "auto")
+    _, unclipped = judged(dull.highlights(material[rows], BRIGHT, NOISE), "auto")
+    assert len(rows) < 0.99 * len(material)
+    assert all_told.gain_db > 1.2 * unclipped.gain_db
+
+
+def test_tissue_that_clips_without_a_coat_gets_none():
+    within, material = photographed(BRIGHT)
+    assert judged(within.highlights(material, BRIGHT, NOISE), "auto")[0] is None
+
+
 def at_roughness(material: torch.Tensor, logit: torch.Tensor | float) -> torch.Tensor:
     low, high = ROUGHNESS_RANGE
     material[:, 3] = low + (high - low) * torch.sigmoid(torch.as_tensor(logit))

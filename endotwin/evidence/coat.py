@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -12,15 +13,21 @@ from scipy.stats import chi2
 
 from endotwin.effects import Decision
 from endotwin.effects.coat import Coat
-from endotwin.evidence.probe import Verdict, compared
+from endotwin.evidence.probe import Verdict, held_out, verdict_of
 from endotwin.pixels.fixed_effects import Design, regress, robust_losses
 
 ROUGHNESSES = (0.045, 0.06, 0.09, 0.13, 0.19, 0.27)
+FINER = (1 / 1.2, 1.2)
+"""Beside the best of each tail."""
+
 TAILS = (2.0, 1.0)
 LEAST_SIGHTINGS = 16
 
 SEARCH_ROUNDS = 2
 """Of the regression by which roughnesses are ranked."""
+
+LONGEST_LOG = 1.5
+"""The farthest that ln of a weight may rise in the step after the first."""
 
 WORTH = chi2.isf(0.01 / (len(ROUGHNESSES) * len(TAILS)), df=1) / 2
 """Log likelihood by which the best of as many lobes beats none in one of a hundred bare tissues."""
@@ -28,7 +35,7 @@ WORTH = chi2.isf(0.01 / (len(ROUGHNESSES) * len(TAILS)), df=1) / 2
 
 @dataclass(frozen=True)
 class Highlights:
-    """Sightings of vertices near the mirror direction, S of them, beside a prediction without a coat.
+    """Sightings of vertices near the mirror direction, S of them, beside a prediction under some coat.
 
     Attributes:
         vertex: int [S]. residual: ln photo − ln prediction [S]. by_tissue: d ln C by ln f0 and by the
@@ -70,34 +77,95 @@ def best_coat(under: Callable[[Coat], Highlights]) -> tuple[Coat, Verdict]:
     """The coat that predicts highlights best, and by how much better than none it does on vertices that did
     not choose its weight.
 
-    Lobes are ranked by what they leave after a second step: a coat may outshine what is under it, where the
-    logarithm is far from linear in its weight, and only one that shines can be held against clipped photos.
-    One that hardly any sighting could have seen weighs nothing.
+    Lobes are ranked, and judged, where their weight is nearly found: a coat may outshine what is under it,
+    where the logarithm is far from linear in its weight. One that hardly any sighting could have seen weighs
+    nothing.
     """
-    width, least, best = 0.0, np.inf, None
-    for lobe in (Coat(0.0, roughness, tail) for tail in TAILS for roughness in ROUGHNESSES):
-        seen = under(lobe)
-        if len(seen.residual) < LEAST_SIGHTINGS:
-            break
-        width = width or regress(seen.residual, _bare(seen.design)).width
-        bare, first = (_fitted(seen.residual, design, width) for design in (_bare(seen.design), seen.design))
-        if first.weight <= 0 or first.loss > bare.loss - WORTH * width**2:
-            continue
-        near = under(replace(lobe, weight=first.weight))
-        second = _fitted(near.residual, near.design, width)
-        if second.loss < least:
-            least, best = second.loss, (replace(lobe, weight=first.weight + second.weight), seen)
-    if best is None:
+    dull = under(Coat(0.0))
+    if len(dull.residual) < LEAST_SIGHTINGS:
         return Coat(0.0), Verdict(0.0, 0.0)
-    coat, seen = best
-    half = (np.random.default_rng(0).random(seen.design.count) < 0.5)[seen.design.group]
-    verdict = compared(seen.residual, _bare(seen.design), seen.design, half, width)
-    return replace(coat, weight=max(0.0, coat.weight)), verdict
+    search = _Search(under, dull)
+    every = [search.under_lobe(roughness, tail) for tail in TAILS for roughness in ROUGHNESSES]
+    found = [each for each in every if each is not None]
+    for tail in TAILS:
+        if of_tail := [each for each in found if each.coat.tail == tail]:
+            middle = min(of_tail, key=_loss).coat.roughness
+            finer = [search.under_lobe(max(ROUGHNESSES[0], middle * step), tail) for step in FINER]
+            found += [each for each in finer if each is not None]
+    if not found:
+        return Coat(0.0), Verdict(0.0, 0.0)
+    best = min(found, key=_loss)
+    return best.coat, search.verdict(best)
+
+
+@dataclass(frozen=True)
+class _Found:
+    """A coat, the sum of the losses under it, and the highlights beside nearly this one."""
+
+    coat: Coat
+    loss: float
+    near: Highlights
+
+
+def _loss(found: _Found) -> float:
+    return found.loss
+
+
+@dataclass(frozen=True)
+class _Search:
+    """Coats held against none.
+
+    Attributes:
+        under: the highlights, by the coat whose weight is sought. dull: those beside none.
+    """
+
+    under: Callable[[Coat], Highlights]
+    dull: Highlights
+
+    @cached_property
+    def _width(self) -> float:
+        return regress(self.dull.residual, _bare(self.dull.design)).width
+
+    @cached_property
+    def _worth(self) -> float:
+        """The most that a coat may leave."""
+        bare = _fitted(self.dull.residual, _bare(self.dull.design), self._width)
+        return bare.loss - WORTH * self._width**2
+
+    def under_lobe(self, roughness: float, tail: float) -> _Found | None:
+        """The weight of a lobe, where it is worth one."""
+        lobe = Coat(0.0, roughness, tail)
+        _, found = self._beside(lobe)
+        if found.weight <= 0 or found.loss > self._worth:
+            return None
+        lobe = replace(lobe, weight=found.weight)
+        _, found = self._beside(lobe)
+        risen = min(found.weight / lobe.weight, LONGEST_LOG)
+        lobe = replace(lobe, weight=lobe.weight * math.exp(risen))
+        near, found = self._beside(lobe)
+        return _Found(replace(lobe, weight=max(0.0, lobe.weight + found.weight)), found.loss, near)
+
+    def _beside(self, coat: Coat) -> tuple[Highlights, _Fitted]:
+        """The highlights under a coat, and what they say should be added to its weight."""
+        seen = self.under(coat)
+        return seen, _fitted(seen.residual, seen.design, self._width)
+
+    def verdict(self, found: _Found) -> Verdict:
+        """How much better the coat explains vertices that did not choose its weight."""
+        both = (self.dull, _bare(self.dull.design)), (found.near, found.near.design)
+        half = np.random.default_rng(0).random(1 + max(seen.vertex.max() for seen, _ in both)) < 0.5
+        before, after = (
+            np.bincount(
+                seen.vertex, held_out(seen.residual, design, half[seen.vertex], self._width), len(half)
+            )
+            for seen, design in both
+        )
+        return verdict_of(before - after, float(after.sum()))
 
 
 @dataclass(frozen=True)
 class _Fitted:
-    """The coat's weight, and the sum of the losses beside it."""
+    """What to add to the coat's weight, and the sum of the losses after it."""
 
     weight: float
     loss: float

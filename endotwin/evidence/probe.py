@@ -318,7 +318,7 @@ def compared(
         target: [N]. half: bool [N], of whole groups: each half chooses for the other. width: of the loss.
         categories: number of the designs' categories.
     """
-    before, after = (_held_out(target, design, half, width, categories) for design in (base, other))
+    before, after = (held_out(target, design, half, width, categories) for design in (base, other))
     return verdict_of(np.bincount(base.group, before - after, base.count), float(after.sum()))
 
 
@@ -329,9 +329,10 @@ def verdict_of(gained: np.ndarray, after: float) -> Verdict:
     return Verdict(10 * math.log10(max(ratio, 1e-30)), float(gained.sum()) / sigma)
 
 
-def _held_out(
-    target: np.ndarray, design: Design, half: np.ndarray, width: float, categories: int
+def held_out(
+    target: np.ndarray, design: Design, half: np.ndarray, width: float, categories: int = 0
 ) -> np.ndarray:
+    """Losses [N] of values whose coefficients the other half chose; arguments as for ``compared``."""
     losses = np.zeros(len(target))
     for part in (half, ~half):
         found = regress(target[part], design[part], categories)

@@ -154,7 +154,8 @@ class Within:
         return self._step(material, shared, kept, torch.ones(len(self.samples), dtype=torch.bool), noise)
 
     def highlights(self, material: Tensor, shared: Globals, noise: float) -> Callable[[Coat], Highlights]:
-        """Sightings near the mirror direction, by a coat of weight 0 over them.
+        """Sightings near the mirror direction, by a coat over them. Clipped ones say 'at least' whatever its
+        weight: they are what a coat explains first, and its absence has to answer for them, too.
 
         Args:
             material: [N, 4] at the samples. noise: of a pixel, in display values.
@@ -163,7 +164,7 @@ class Within:
         shiny &= torch.from_numpy(self.vertex % max(1, int(shiny.sum()) // HIGHLIGHT_PIXELS) == 0)
 
         def under(coat: Coat) -> Highlights:
-            seen = self.sightings(material, replace(shared, coat=coat), shiny, noise)
+            seen = self.sightings(material, replace(shared, coat=coat), shiny, noise, at_least=True)
             nuisance = np.c_[seen.slopes[:, F0], seen.by_roughness]
             return Highlights(seen.vertex, seen.residual, nuisance, seen.by_coat)
 
@@ -224,16 +225,22 @@ class Within:
         return float(self.samples.log_distance.median().exp())
 
     def sightings(
-        self, material: Tensor, shared: Globals, chosen: Tensor, noise: float, varied: Varied = STILL
+        self,
+        material: Tensor,
+        shared: Globals,
+        chosen: Tensor,
+        noise: float,
+        varied: Varied = STILL,
+        at_least: bool = False,
     ) -> Sightings:
         """Sightings of the ``chosen`` samples (bool [N]) that are neither dark nor clipped; but under a coat
-        that shines a clipped channel says 'at least'.
+        that shines, or if asked for, a clipped channel says ``at_least``.
 
         What varies among the pixels of a sighting is where about the vertex they lie: texture, not light.
         """
         clipped = self.samples.color >= BRIGHT
         usable = chosen & (self.samples.color.amax(dim=1) > 0)
-        if shared.coat is None or shared.coat.weight == 0:
+        if not at_least and (shared.coat is None or shared.coat.weight == 0):
             usable &= ~clipped.any(dim=1)
         rows = torch.nonzero(usable)[:, 0]
         model = linearise(self.samples[rows], material[rows], shared)
