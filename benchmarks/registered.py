@@ -131,7 +131,9 @@ def rows(options: argparse.Namespace) -> Iterator[list[str]]:
             *(f"{scores.psnr:.1f} / {scores.psnr_covered:.1f}" for scores in (plain, aligned)),
             f"{aligned.gamma:.4f}",
             *(
-                f"{each.aligned_mm if wrong.depth_too else each.ate_mm:.3f} mm/{each.ate_deg:.3f}°"
+                f"{each.aligned_mm:.3f} mm/{each.aligned_deg:.3f}°"
+                if wrong.depth_too
+                else f"{each.ate_mm:.3f} mm/{each.ate_deg:.3f}°"
                 for each in apart
             ),
         ]

@@ -123,20 +123,21 @@ class Aligner:
         was = self._errors(scene, none)
         shared = self._steps(scene, none, self.choosers, BLURS)
         now = self._errors(scene, shared)
+        gained = now.better_than(was)
+        if not forced and not _keeps(gained):
+            return None, f"what the photos ask for does not help others ({gained})", gained
         lensed = self._steps(scene, shared, self.choosers, LENS_BLURS, lens=True)
         seen = self._errors(scene, lensed)
         lens = _keeps(seen.better_than(now), LENS_GAIN_DB, LENS_SIGMAS)
         if lens:
             shared, now = lensed, seen
-        gained = now.better_than(was)
-        if not forced and not _keeps(gained):
-            return None, f"what the photos ask for does not help others ({gained})", gained
         own = self._steps(scene, shared, self.choosers, OWN_BLURS, lens, own=True)
         more = self._errors(scene, own)
         if _keeps(more.better_than(now)):
             best = self._steps(scene, own, self.frames, OWN_BLURS[:1], lens, own=True)
             verdict = more.better_than(was)
             return best, f"shared and drift: {verdict}", verdict
+        gained = now.better_than(was)
         return self._steps(scene, shared, self.frames, OWN_BLURS[:1], lens), f"shared: {gained}", gained
 
     def _through(self, scene: Scene, now: Corrections) -> Scene:

@@ -2,18 +2,21 @@
 poses are wrong, whatever the photos show.
 
 Point-to-plane registration of every frame to the surface of all (Chen & Medioni 1992), which is fused again.
+The surface goes where its depth maps go: all are solved for at once, the level of every place eliminated.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import replace
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from endotwin.align.corrections import Corrections, shared_spread
+from endotwin.align.coupled import coupled
 from endotwin.align.motion import moved
 from endotwin.config import FuseConfig
+from endotwin.pixels.length_unit import unit_mm
 from endotwin.run.ahead import ahead
 from endotwin.run.threads import THREADS
 from endotwin.sequence import Sequence
@@ -34,8 +37,19 @@ HUBER = 2.0
 ALIKE = 20.0
 """What is wrong with surface and depth errs alike in so many pixels."""
 
-ROUNDS, STEPS = 4, 3
+ROUNDS, STEPS = 2, 3
 """Of fusing, and of steps on each surface."""
+
+CELL_MM = 2.0
+"""Places that have a level of their own: small beside what a depth map sees, large beside its pixels."""
+
+TOGETHER = 200
+"""So many depth maps, evenly spread, are brought next to each other at once."""
+
+LEAST_POINTS = 100
+"""A depth map that meets the surface in fewer does not move by itself."""
+
+_PRIOR = np.diag(1 / shared_spread()[:6] ** 2)
 
 COARSER = 2.0
 """Surfaces but the last are fused at so much larger voxels."""
@@ -46,43 +60,98 @@ MIN_GAIN_DB = 2.0
 GLANCE_FRAMES = 12
 
 
-def disagreement(
-    caster: Caster, sequence: Sequence, poses: np.ndarray, frames: np.ndarray
-) -> tuple[np.ndarray, float]:
-    """The twist [F, 6] that brings each depth map of ``frames`` [F] next to the surface of ``caster``, and
-    the robust width of their distances to it now, in mm.
+@dataclass(frozen=True)
+class _Beside:
+    """Points of a depth map beside a surface, P of them.
+
+    Attributes:
+        points_mm: [P, 3], of the surface. distance_mm: [P], along its normals. slopes: [P, 6], of that by the
+            camera's twist. weight: [P], in units of the robust ``width_mm``.
+    """
+
+    points_mm: np.ndarray
+    distance_mm: np.ndarray
+    slopes: np.ndarray
+    weight: np.ndarray
+    width_mm: float
+
+    @classmethod
+    def of(cls, caster: Caster, sequence: Sequence, pose: np.ndarray, frame: int) -> _Beside:
+        depth_mm = sequence.depth_mm(frame)
+        known = np.flatnonzero(np.isfinite(depth_mm))
+        drawn = np.random.default_rng(frame).choice(known, min(PIXELS, len(known)), replace=False)
+        chosen = np.zeros(depth_mm.size, bool)
+        chosen[drawn] = True
+        hits = caster.cast(sequence.camera, pose, chosen.reshape(depth_mm.shape))
+        rays = sequence.camera.pixel_directions.reshape(-1, 3)[hits.pixel].astype(np.float64)
+        measured = rays * (depth_mm.reshape(-1)[hits.pixel] / rays[:, 2])[:, None]
+        normals = hits.interpolate(caster.surface, caster.surface.normals).astype(np.float64)
+        normals = unit(normals @ pose[:3, :3])
+        met = rays * hits.distance_mm[:, None]
+        near = np.abs(dot(measured - met, rays)) < FARTHEST * hits.distance_mm
+        rows = np.flatnonzero(near & (-dot(normals, rays) > GRAZING))
+        normals, measured, met = normals[rows], measured[rows], met[rows]
+        distance_mm = dot(normals, measured - met)
+        width_mm = max(1.4826 * float(np.median(np.abs(distance_mm))), 1e-6) if len(rows) else 1e-6
+        weight = 1 / np.maximum(1, np.abs(distance_mm) / (HUBER * width_mm)) / (width_mm**2 * ALIKE)
+        slopes = np.concatenate([np.cross(measured, normals), normals], axis=1)
+        return cls(met @ pose[:3, :3].T + pose[:3, 3], distance_mm, slopes, weight, width_mm)
+
+    @property
+    def tells(self) -> bool:
+        return len(self.weight) >= LEAST_POINTS
+
+
+def beside(caster: Caster, sequence: Sequence, poses: np.ndarray, frames: np.ndarray) -> Iterator[_Beside]:
+    """What the depth maps of ``frames`` [F] show beside the surface of ``caster`` at ``poses`` [N, 4, 4]."""
+    caster = caster.threaded(1)
+    return ahead(lambda f: _Beside.of(caster, sequence, poses[f], f), frames.tolist(), THREADS)
+
+
+def _width_mm(maps: list[_Beside]) -> float:
+    """Robust width of the maps' distances to the surface, mean of those that tell."""
+    widths = [each.width_mm for each in maps if each.tells]
+    return float(np.mean(widths)) if widths else 0.0
+
+
+def each_alone(maps: Iterable[_Beside]) -> np.ndarray:
+    """The twist [F, 6] that brings each depth map next to a surface that stays."""
+
+    def alone(each: _Beside) -> np.ndarray:
+        if not each.tells:
+            return np.zeros(6)
+        normal = (each.slopes * each.weight[:, None]).T @ each.slopes + _PRIOR
+        return np.linalg.solve(normal, -each.slopes.T @ (each.weight * each.distance_mm))
+
+    return np.stack([alone(each) for each in maps])
+
+
+def all_together(maps: list[_Beside], own: np.ndarray, cell_mm: float) -> np.ndarray:
+    """The twist [F, 6] that brings each depth map next to the others, wherever the surface then lies: bends
+    of the whole path would else unbend by a little in each round.
 
     Args:
-        poses: T_world_camera [N, 4, 4] by frame.
+        own: [F, 6], how far each has moved from where it was written. cell_mm: places of this size have a
+            level of their own.
     """
-    caster = caster.threaded(1)
-    found = list(ahead(lambda f: _one(caster, sequence, poses[f], f), frames.tolist(), THREADS))
-    widths = [width for _, width in found if width > 0]
-    return np.array([twist for twist, _ in found]), float(np.mean(widths)) if widths else 0.0
-
-
-def _one(caster: Caster, sequence: Sequence, pose: np.ndarray, frame: int) -> tuple[np.ndarray, float]:
-    depth_mm = sequence.depth_mm(frame)
-    known = np.flatnonzero(np.isfinite(depth_mm))
-    drawn = np.random.default_rng(frame).choice(known, min(PIXELS, len(known)), replace=False)
-    chosen = np.zeros(depth_mm.size, bool)
-    chosen[drawn] = True
-    hits = caster.cast(sequence.camera, pose, chosen.reshape(depth_mm.shape))
-    rays = sequence.camera.pixel_directions.reshape(-1, 3)[hits.pixel].astype(np.float64)
-    measured = rays * (depth_mm.reshape(-1)[hits.pixel] / rays[:, 2])[:, None]
-    normals = unit(hits.interpolate(caster.surface, caster.surface.normals).astype(np.float64) @ pose[:3, :3])
-    apart = measured - rays * hits.distance_mm[:, None]
-    near = np.abs(dot(apart, rays)) < FARTHEST * hits.distance_mm
-    rows = np.flatnonzero(near & (-dot(normals, rays) > GRAZING))
-    if len(rows) < 100:
-        return np.zeros(6), 0.0
-    normals, measured = normals[rows], measured[rows]
-    distance = dot(normals, apart[rows])
-    width = max(1.4826 * float(np.median(np.abs(distance))), 1e-6)
-    weight = 1 / np.maximum(1, np.abs(distance) / (HUBER * width)) / (width**2 * ALIKE)
-    slopes = np.concatenate([np.cross(measured, normals), normals], axis=1)
-    normal = (slopes * weight[:, None]).T @ slopes + np.diag(1 / shared_spread()[:6] ** 2)
-    return np.linalg.solve(normal, -slopes.T @ (weight * distance)), width
+    count = len(maps)
+    frame = np.repeat(np.arange(count), [len(each.weight) for each in maps])
+    points, distance, slopes, weight = (
+        np.concatenate([getattr(each, name) for each in maps])
+        for name in ("points_mm", "distance_mm", "slopes", "weight")
+    )
+    cells = np.floor(points / cell_mm).astype(np.int64)
+    place = np.unique(cells, axis=0, return_inverse=True)[1].reshape(-1)
+    places = int(place.max()) + 1 if len(place) else 0
+    pair, which = np.unique(frame * places + place, return_inverse=True)
+    total = np.bincount(which, weight)
+    frame, place = pair // places, pair % places
+    distance, *slopes = (np.bincount(which, weight * x) / total for x in (distance, *slopes.T))
+    distance -= (np.bincount(place, total * distance) / np.bincount(place, total))[place]
+    matrix, right = coupled(np.stack(slopes, axis=1), distance, total, frame, place, (count, places))
+    normal = matrix.reshape(6 * count, 6 * count) + np.kron(np.eye(count), _PRIOR)
+    pull = right.reshape(-1) - (own @ _PRIOR).reshape(-1)
+    return np.linalg.solve(normal, pull).reshape(count, 6)
 
 
 def gain_db(twin: Twin, sequence: Sequence, caster: Caster) -> float:
@@ -90,10 +159,23 @@ def gain_db(twin: Twin, sequence: Sequence, caster: Caster) -> float:
     training = np.array(twin.source.training(len(sequence)))
     some = training[spread(len(training), GLANCE_FRAMES)]
     poses = sequence.T_world_camera.copy()
-    twists, before = disagreement(caster, sequence, poses, some)
-    poses[some] = moved(poses[some], twists)
-    after = disagreement(caster, sequence, poses, some)[1]
+    maps = list(beside(caster, sequence, poses, some))
+    poses[some] = moved(poses[some], each_alone(maps))
+    before, after = (_width_mm(each) for each in (maps, list(beside(caster, sequence, poses, some))))
     return 20 * float(np.log10(before / after)) if min(before, after) > 0 else 0.0
+
+
+def _nearer(surface: Surface, sequence: Sequence, now: Corrections, frames: np.ndarray) -> Corrections:
+    """The corrections that bring the depth maps of ``frames`` [F] next to each other, and those beyond
+    TOGETHER next to the surface."""
+    caster, stays = Caster(surface), np.zeros(len(now.shared))
+    some = frames[spread(len(frames), TOGETHER)]
+    for _ in range(STEPS):
+        maps = list(beside(caster, sequence, now.poses, some))
+        now = now.stepped(stays, all_together(maps, now.own[some], CELL_MM * unit_mm(surface)), some)
+    if len(some) < len(frames):
+        now = now.stepped(stays, each_alone(beside(caster, sequence, now.poses, frames)), frames)
+    return now
 
 
 def registered(
@@ -112,10 +194,7 @@ def registered(
     config = FuseConfig(**made.get("config", {}))
     now, surface = Corrections.none(sequence.T_world_camera), twin.surface
     for number in range(ROUNDS):
-        caster = Caster(surface)
-        for _ in range(STEPS):
-            twists = disagreement(caster, sequence, now.poses, frames)[0]
-            now = now.stepped(np.zeros(len(now.shared)), twists, frames)
+        now = _nearer(surface, sequence, now, frames)
         factor = config.voxel * (1 if number == ROUNDS - 1 else COARSER)
         at_poses = replace(sequence, T_world_camera=now.poses)
         voxel_mm = made.get("voxel_mm")

@@ -15,20 +15,22 @@ class Apart:
     """Root mean squares over poses, or over steps from one pose to the next.
 
     Attributes:
-        ate_mm, ate_deg: of poses as they stand. aligned_mm: of positions after the best rigid motion of all.
+        ate_mm, ate_deg: of poses as they stand. aligned_mm: of places after the best rigid motion of all;
+            aligned_deg: of turns after the best turn of all.
         rpe_mm, rpe_deg: of steps.
     """
 
     ate_mm: float
     ate_deg: float
     aligned_mm: float
+    aligned_deg: float
     rpe_mm: float
     rpe_deg: float
 
     def __str__(self) -> str:
         return (
             f"ATE {self.ate_mm:.4f} mm, {self.ate_deg:.4f}° "
-            f"(after the best rigid motion {self.aligned_mm:.4f} mm); "
+            f"(after the best rigid motion {self.aligned_mm:.4f} mm, {self.aligned_deg:.4f}°); "
             f"RPE a frame {self.rpe_mm:.4f} mm, {self.rpe_deg:.4f}°"
         )
 
@@ -48,6 +50,7 @@ def compare(T: np.ndarray, T_true: np.ndarray) -> Apart:
         ate_mm=_rms(np.linalg.norm(place - true, axis=1)),
         ate_deg=_rms(_degrees(apart)),
         aligned_mm=_rms(np.linalg.norm(_superposed(place, true) - true, axis=1)),
+        aligned_deg=_rms(_degrees(_turned_alike(T, T_true))),
         rpe_mm=_rms(np.linalg.norm(steps[:, :3, 3], axis=1)),
         rpe_deg=_rms(_degrees(steps)),
     )
@@ -59,6 +62,14 @@ def _superposed(points: np.ndarray, onto: np.ndarray) -> np.ndarray:
     left, _, right = np.linalg.svd(target.T @ centred)
     mirror = np.diag([1.0, 1.0, np.sign(np.linalg.det(left @ right))])
     return centred @ (left @ mirror @ right).T + onto.mean(axis=0)
+
+
+def _turned_alike(T: np.ndarray, T_true: np.ndarray) -> np.ndarray:
+    """What is left [N, 4, 4] between the turns of poses after the one that they have in common: places on a
+    straight path would not tell it."""
+    turns, true = (Rotation.from_matrix(each[:, :3, :3]) for each in (T, T_true))
+    common = (true * turns.inv()).mean()
+    return (true.inv() * common * turns).as_matrix()
 
 
 def _degrees(T: np.ndarray) -> np.ndarray:

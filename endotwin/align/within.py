@@ -4,10 +4,10 @@ out."""
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 
+from endotwin.align.coupled import coupled
 from endotwin.align.photos import Photo
 from endotwin.align.scene import SHADING, SHADING_MEAN, SHADING_SPREAD, Scene
 from endotwin.align.texture import LIGHT_CELLS, sighted
@@ -17,9 +17,6 @@ from endotwin.run.threads import THREADS
 HUBER = 2.0
 ROUNDS = 4
 """Of reweighting, and of taking out vertices' and cells' means in turn."""
-
-CHUNK = 2000
-"""Vertices whose sightings are multiplied at a time."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,28 +43,9 @@ class Within:
     def normal_equations(self, count: int) -> tuple[np.ndarray, np.ndarray]:
         """Matrix [F, 9, F, 9] and right-hand side [F, 9] of the twists and intrinsics of ``count`` photos, in
         units of the residuals' variance."""
-        weighted = self.slopes * self.weight[:, None]
-        width = weighted.shape[1]
-        own = np.zeros((count, width, width))
-        right = np.stack([-np.bincount(self.photo, x * self.residual, count) for x in weighted.T], axis=1)
-        bounds = np.searchsorted(self.photo, np.arange(count + 1))
-        for number, (start, stop) in enumerate(pairwise(bounds)):
-            own[number] = weighted[start:stop].T @ self.slopes[start:stop]
-        full = np.zeros((count, width, count, width))
-        full[np.arange(count), :, np.arange(count)] = own
-        full = full.reshape(width * count, width * count)
-        total = np.bincount(self.vertex, self.weight, len(self.log_albedo))
-        order = np.argsort(self.vertex, kind="stable")
-        starts = np.arange(0, len(total), CHUNK)
-        edges = np.searchsorted(self.vertex[order], np.r_[starts, len(total)])
-        for start, low, high in zip(starts, edges[:-1], edges[1:], strict=True):
-            rows = order[low:high]
-            sums = np.zeros((min(CHUNK, len(total) - start), count, width), np.float32)
-            sums[self.vertex[rows] - start, self.photo[rows]] = weighted[rows]
-            sums /= np.sqrt(np.maximum(total[start : start + CHUNK], 1e-9))[:, None, None]
-            flat = sums.reshape(len(sums), -1)
-            full -= flat.T @ flat
-        return full.reshape(count, width, count, width) / self.width**2, right / self.width**2
+        rows = self.slopes, self.residual, self.weight, self.photo, self.vertex
+        matrix, right = coupled(*rows, (count, len(self.log_albedo)))
+        return matrix / self.width**2, right / self.width**2
 
 
 def within(
