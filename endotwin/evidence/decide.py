@@ -139,7 +139,7 @@ class _Trial:
         self._guides_mm = dict.fromkeys((False, True), found_mm)
         if found_mm == AT_LENS or self.wanted("interreflection") != "auto" or self._late():
             return
-        other = replace(base, bounced=None if bounces else self._bouncing(found_mm))
+        other = replace(base, bounced=None if bounces else self._bouncing(AT_LENS))
         other_mm = found_guides(self._probe, other, self._glints(), False)
         if other_mm != AT_LENS:
             self._guides_mm[not bounces] = other_mm
