@@ -117,7 +117,7 @@ def test_coupled_equations_are_those_in_which_the_levels_of_places_are_solved_fo
     columns[np.arange(len(frame)), 15 + place] = 1
     whole = np.linalg.lstsq(columns * np.sqrt(weight)[:, None], -value * np.sqrt(weight), rcond=None)[0]
     found = np.linalg.solve(matrix.reshape(15, 15), right.reshape(15))
-    np.testing.assert_allclose(found, whole[:15], rtol=1e-4, atol=1e-4)
+    np.testing.assert_allclose(found, whole[:15], atol=1e-9)
 
 
 def test_ate_and_rpe_are_those_of_evo():

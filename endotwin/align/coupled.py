@@ -42,7 +42,7 @@ def coupled(
     edges = np.searchsorted(place[order], np.r_[starts, places])
     for start, low, high in zip(starts, edges[:-1], edges[1:], strict=True):
         rows = order[low:high]
-        sums = np.zeros((min(CHUNK, places - start), count, width), np.float32)
+        sums = np.zeros((min(CHUNK, places - start), count, width))
         sums[place[rows] - start, frame[rows]] = weighted[rows]
         sums /= np.sqrt(np.maximum(total[start : start + CHUNK], 1e-9))[:, None, None]
         flat = sums.reshape(len(sums), -1)
