@@ -17,6 +17,7 @@ from endotwin.twin import Light, Response
 
 VERTICES, SIGHTINGS = 600, 40
 TRUE = Globals.of(Light(120.0, 1.7, 2.2), Response(0.42), f0=0.035)
+BRIGHT = Globals.of(Light(360.0, 1.7, 2.2), Response(0.42), f0=0.035)
 ROUGHNESS = 0.45
 NOISE = 1 / 255
 
@@ -95,9 +96,6 @@ def test_the_shape_of_diffuse_light_does_not_bend_the_response(roughness):
     for _ in range(6):
         shared = within.renewed(material, shared, (), NOISE).shared
     assert told(shared)[:3] == pytest.approx(told(TRUE)[:3], rel=0.02)
-
-
-BRIGHT = Globals.of(Light(360.0, 1.7, 2.2), Response(0.42), f0=0.035)
 
 
 def test_highlights_that_clip_bear_a_coat_out():
