@@ -36,7 +36,7 @@ JUDGES = 3
 BLURS = (0.006, 0.003, 0.0015, 0.0015, 0.0015, 0.0015)
 """Widths of the blurs, coarse to fine, of the image's width."""
 
-LENS_BLURS = BLURS[2:]
+LENS_BLURS = BLURS[3:]
 OWN_BLURS = (0.0015, 0.0015, 0.0015)
 
 LEAST_BLUR_PX = 0.7
