@@ -135,7 +135,6 @@ class Within:
 
         How diffuse light falls off towards grazing says most of γ, and the lobe that tissue really has is
         nobody's: off the highlights its shape, which Burley's roughness sets, is found beside them and left.
-        Not beside guides that move: their places, γ and that shape together would drift.
 
         Args:
             material: [N, 4] at the samples. held: which of n, q and gamma stay. noise: of a pixel, in display
@@ -188,9 +187,9 @@ class Within:
         if not free.shape[1] or len(seen.residual) < LEAST_SIGHTINGS:
             return Renewed(shared, np.zeros(varied.frames), np.zeros((varied.guides, 3)))
         frame = np.searchsorted(self.samples.views.frames, seen.frame) if varied.frames else None
-        shaped = "f0" in held and not varied.guides
-        coated = "f0" not in held and shared.coat is not None
-        columns, prior = self._columns(seen, shared, free, shaped, coated)
+        diffuse = "f0" in held
+        coated = not diffuse and shared.coat is not None
+        columns, prior = self._columns(seen, shared, free, diffuse, coated)
         design = Design(columns, seen.vertex, self.count, frame, seen.weight, prior)
         found = regress(seen.residual, design, varied.frames, rounds=REWEIGHTS)
         count, guides = free.shape[1], seen.by_guides.shape[1]
@@ -206,10 +205,10 @@ class Within:
         return Renewed(moved, length * log_gain, length * places.reshape(-1, 3), length * float(rougher))
 
     def _columns(
-        self, seen: Sightings, shared: Globals, free: np.ndarray, shaped: bool, coated: bool
+        self, seen: Sightings, shared: Globals, free: np.ndarray, diffuse: bool, coated: bool
     ) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]:
-        """Columns of the ``free`` directions, of the guides' places, of roughness where the diffuse lobe is
-        ``shaped`` or a coat is sought, and then of its weight; and what is known of their coefficients."""
+        """Columns of the ``free`` directions, of the guides' places, of roughness where light is ``diffuse``
+        or a coat is sought, and then of its weight; and what is known of their coefficients."""
         mean, spread = (x.numpy() for x in global_prior(self.unit_mm, len(shared.vector)))
         guides = seen.by_guides.shape[1]
         parts = [
@@ -218,7 +217,7 @@ class Within:
         ]
         pulls = [free.T @ (TEMPER * (mean - shared.vector.numpy()) / spread**2), np.zeros(guides)]
         columns = [seen.slopes @ free, seen.by_guides]
-        if shaped or coated:
+        if diffuse or coated:
             columns.append(seen.by_roughness[:, None])
             parts.append([[TEMPER / ROUGHNESS_LOGIT_SPREAD**2]])
             pulls.append([0.0])
