@@ -53,7 +53,7 @@ def test_twenty_seeds_agree_within_three_tenths_of_a_decibel_and_one_percent_of_
 
 @pytest.mark.parametrize("gamma, n, q", [(1.5, 1.0, 1.0), (0.7, 1.0, 1.0), (1.0, 1.6, 0.8), (1.2, 0.5, 1.2)])
 def test_refinement_from_a_bad_start_comes_to_the_same_light(tube, monkeypatch, gamma, n, q):
-    """From γ off by up to half, n by 60 % or q by 20 %, six steps lead to within 1 % of γ and 2 dB."""
+    """From γ off by up to half, n by 60 % or q by 20 %, six steps lead to within 1.5 % of γ and 2 dB."""
     good = endotwin.fit_twin(tube)
     closed_form = solve.closed_form
 
@@ -66,7 +66,7 @@ def test_refinement_from_a_bad_start_comes_to_the_same_light(tube, monkeypatch, 
     twin = endotwin.fit_twin(tube)
     scores = [endotwin.evaluate(one).psnr_covered for one in (twin, good)]
     assert scores[0] > scores[1] - 2
-    assert twin.response.gamma == pytest.approx(good.response.gamma, rel=0.01)
+    assert twin.response.gamma == pytest.approx(good.response.gamma, rel=0.015)
 
 
 def test_single_precision_gives_the_light_materials_and_scores_of_double(tube):
