@@ -3,9 +3,9 @@
     python benchmarks/registered.py DATA/colon_direct --mesh DATA/colon_direct/truth/colon.ply --scale 0.5
 
 As C3VD is made: photos stay, poses err as a model put into the recorder's frame by hand errs, and depth is of
-the true surface at the erring poses through the erring calibration. In the row before the last depth was
-taken with the photo, and errs with it. Sizes
-are exact for motions that all frames share, and root mean squares for those of each.
+the true surface at the erring poses through the erring calibration; but in the row that says so it was taken
+with the photo, and errs with it. Sizes are exact for motions that all frames share, and root mean squares for
+those of each.
 
 Columns: PSNR of the whole and the covered part of held-out photos, as written and aligned; γ of the aligned
 twin; errors of all poses, as written and aligned (where depth errs, after the best rigid motion).
@@ -27,7 +27,7 @@ from scipy.spatial.transform import Rotation
 
 import endotwin
 from endotwin.align.motion import Path as Recorded
-from endotwin.align.trajectory import compare
+from endotwin.align.trajectory import Apart, compare
 from endotwin.sequence import Sequence
 from endotwin.sequence.poses import write_c3vd_poses
 from endotwin.sequence.readers.c3vd import DEPTH_RANGE_MM
@@ -54,6 +54,12 @@ class Wrong:
     jitter: Size = (0.0, 0.0)
     depth_too: bool = False
     intrinsics: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    def sizes(self, apart: Apart) -> Size:
+        """Of what is left; where depth errs, too, of that after the best rigid motion."""
+        if self.depth_too:
+            return apart.aligned_mm, apart.aligned_deg
+        return apart.ate_mm, apart.ate_deg
 
     def poses(self, T_world_camera: np.ndarray, seed: int) -> np.ndarray:
         """What is written [N, 4, 4] where the camera was at ``T_world_camera`` [N, 4, 4]."""
@@ -130,12 +136,7 @@ def rows(options: argparse.Namespace) -> Iterator[list[str]]:
             name,
             *(f"{scores.psnr:.1f} / {scores.psnr_covered:.1f}" for scores in (plain, aligned)),
             f"{aligned.gamma:.4f}",
-            *(
-                f"{each.aligned_mm:.3f} mm/{each.aligned_deg:.3f}°"
-                if wrong.depth_too
-                else f"{each.ate_mm:.3f} mm/{each.ate_deg:.3f}°"
-                for each in apart
-            ),
+            *(f"{mm:.3f} mm/{deg:.3f}°" for mm, deg in map(wrong.sizes, apart)),
         ]
 
 

@@ -9,7 +9,7 @@ import typer
 from endotwin.cli import console
 
 from endotwin.errors import OutputError
-from endotwin.run.output import TWIN, check_free
+from endotwin.run.output import TWIN, check_free, whole_file
 
 
 def align(
@@ -65,7 +65,8 @@ def align(
     with console.command("align", profile) as run:
         with run.stage("import"):
             from endotwin.align.trajectory import compare
-            from endotwin.align.written import write_camera, write_poses
+            from endotwin.align.written import write_poses
+            from endotwin.cameras import write_camera
             from endotwin.pipeline import align_twin
             from endotwin.sequence.poses import read_poses
             from endotwin.twin import Twin
@@ -90,7 +91,8 @@ def align(
             if poses is not None:
                 write_poses(poses, sequence, overwrite)
             if camera is not None:
-                write_camera(camera, aligned.at_scale(1.0).camera, overwrite)
+                with whole_file(camera, overwrite) as file:
+                    write_camera(file, aligned.at_scale(1.0).camera)
     print("\n".join(lines))
     print("wrote", " and ".join(map(str, filter(None, (output or twin_folder, poses, camera)))))
 

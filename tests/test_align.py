@@ -18,8 +18,8 @@ from endotwin.align.photos import read_photos
 from endotwin.align.scene import SHADING_MEAN, Scene
 from endotwin.align.texture import sighted
 from endotwin.align.trajectory import compare
-from endotwin.align.written import write_camera, write_poses
-from endotwin.cameras import read_camera
+from endotwin.align.written import write_poses
+from endotwin.cameras import read_camera, write_camera
 from endotwin.errors import SequenceError, TrajectoryError
 from endotwin.sequence.poses import read_c3vd_poses, read_poses, write_c3vd_poses
 from endotwin.surface.casting import Caster

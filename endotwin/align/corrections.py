@@ -106,14 +106,16 @@ class Corrections:
         smooth[frames] = told
         return replace(self, shared=self.shared + shared, own=smooth)
 
-    def without_own(self) -> Corrections:
-        return replace(self, own=np.zeros_like(self.own))
-
 
 def shared_spread() -> np.ndarray:
     """Prior standard deviations of the shared numbers, [16]."""
     one = np.r_[np.full(3, np.radians(SPREAD_DEG)), np.full(3, SPREAD_MM)]
     return np.r_[one, one, SPREAD_LAG, SPREAD_FOCAL, SPREAD_CENTRE, SPREAD_CENTRE]
+
+
+def pose_precision() -> np.ndarray:
+    """Prior precision [6, 6] of a pose's twist, which errs as the hand-eye matrix does."""
+    return np.diag(1 / shared_spread()[:6] ** 2)
 
 
 def own_spread() -> np.ndarray:

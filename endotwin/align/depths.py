@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from endotwin.align.corrections import Corrections, shared_spread
+from endotwin.align.corrections import Corrections, pose_precision
 from endotwin.align.coupled import coupled
 from endotwin.align.motion import moved
 from endotwin.config import FuseConfig
@@ -49,7 +49,7 @@ TOGETHER = 200
 LEAST_POINTS = 100
 """A depth map that meets the surface in fewer does not move by itself."""
 
-_PRIOR = np.diag(1 / shared_spread()[:6] ** 2)
+_PRIOR = pose_precision()
 
 COARSER = 2.0
 """Surfaces but the last are fused at so much larger voxels."""

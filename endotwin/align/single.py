@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from endotwin.align.corrections import shared_spread
+from endotwin.align.corrections import pose_precision
 from endotwin.align.motion import moved, twists_between
 from endotwin.align.photos import DARKEST, Photo, log_blurred
 from endotwin.align.rims import BAND_SIGMAS, least_within, moving_slopes
@@ -58,7 +58,7 @@ def placed(
         weight /= width**2 * ALIKE * 4 * np.pi * sigma_px**2
         slopes = slopes - np.average(slopes, axis=0, weights=weight)
         gone = twists_between(T_world_camera[None], T[None])[0]
-        prior = np.diag(1 / shared_spread()[:6] ** 2)
+        prior = pose_precision()
         normal = (slopes * weight[:, None]).T @ slopes + prior
         T = moved(T, np.linalg.solve(normal, -slopes.T @ (weight * left) - prior @ gone))
     return T

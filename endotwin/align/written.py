@@ -1,11 +1,9 @@
-"""Corrected poses, and the camera that goes with them, as files that other tools read."""
+"""Corrected poses as a file that other tools read."""
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
-from endotwin.cameras import Camera
 from endotwin.run.output import whole_file
 from endotwin.sequence import Sequence
 from endotwin.sequence.poses import write_c3vd_poses, write_transforms_poses, write_tum_poses
@@ -28,13 +26,3 @@ def write_poses(path: Path, sequence: Sequence, overwrite: bool = False) -> None
             write_transforms_poses(file, sequence.T_world_camera, source)
         else:
             write_tum_poses(file, sequence.T_world_camera, sequence.timestamps_s)
-
-
-def write_camera(path: Path, camera: Camera, overwrite: bool = False) -> None:
-    """Write a ``camera.json``.
-
-    Raises:
-        OutputError: ``path`` exists or cannot be written.
-    """
-    with whole_file(Path(path), overwrite) as file:
-        file.write_text(json.dumps(camera.to_dict(), indent=2) + "\n", encoding="utf-8")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import MISSING, fields
 from math import isfinite
 from pathlib import Path
@@ -24,6 +25,7 @@ __all__ = [
     "Pinhole",
     "camera_from_dict",
     "read_camera",
+    "write_camera",
 ]
 
 VIEW_GRID = 24
@@ -108,6 +110,11 @@ def read_camera(path: Path) -> Camera:
             f"{path} cannot be read as JSON ({error}); write it as {_example(Pinhole)}"
         ) from error
     return camera_from_dict(description, path)
+
+
+def write_camera(path: Path, camera: Camera) -> None:
+    """Write the ``camera.json`` of a camera, which ``read_camera`` reads back."""
+    path.write_text(json.dumps(camera.to_dict(), indent=1) + "\n", encoding="utf-8")
 
 
 def _require_view(camera: Camera, where: Path) -> None:

@@ -6,6 +6,7 @@ Camera frame as in OpenCV: x right, y down, z forward. Pixel centres lie at inte
 from __future__ import annotations
 
 import dataclasses
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from functools import cached_property
@@ -58,7 +59,7 @@ class Camera(ABC):
         centre goes, to the right and down, as shares of the width."""
         longer, right, down = (float(value) for value in intrinsics)
         moved = {"cx": self.cx + right * self.width, "cy": self.cy + down * self.width}
-        return dataclasses.replace(self.lengthened(np.exp(longer)), **moved)
+        return dataclasses.replace(self.lengthened(math.exp(longer)), **moved)
 
     @cached_property
     def pixel_directions(self) -> np.ndarray:

@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
+from operator import attrgetter
 
 import numpy as np
 from scipy.stats import chi2
@@ -18,7 +19,7 @@ from endotwin.pixels.fixed_effects import Design, regress, robust_losses
 
 ROUGHNESSES = (0.045, 0.06, 0.09, 0.13, 0.19, 0.27)
 FINER = (1 / 1.2, 1.2)
-"""Beside the best of each tail."""
+"""Beside the best of each tail, none sharper than the sharpest."""
 
 TAILS = (2.0, 1.0)
 LEAST_SIGHTINGS = 16
@@ -89,12 +90,12 @@ def best_coat(under: Callable[[Coat], Highlights]) -> tuple[Coat, Verdict]:
     found = [each for each in every if each is not None]
     for tail in TAILS:
         if of_tail := [each for each in found if each.coat.tail == tail]:
-            middle = min(of_tail, key=_loss).coat.roughness
-            finer = [search.under_lobe(max(ROUGHNESSES[0], middle * step), tail) for step in FINER]
+            beside = (min(of_tail, key=_LOSS).coat.roughness * step for step in FINER)
+            finer = (search.under_lobe(each, tail) for each in beside if each >= ROUGHNESSES[0])
             found += [each for each in finer if each is not None]
     if not found:
         return Coat(0.0), Verdict(0.0, 0.0)
-    best = min(found, key=_loss)
+    best = min(found, key=_LOSS)
     return best.coat, search.verdict(best)
 
 
@@ -107,8 +108,7 @@ class _Found:
     near: Highlights
 
 
-def _loss(found: _Found) -> float:
-    return found.loss
+_LOSS = attrgetter("loss")
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,8 @@ class Registration:
         twists: one a frame, T_world_camera = T_written · exp(twist): a rotation vector in radians, then a
             translation in mm, in the camera's frame (SciPy's exponential coordinates).
         found: what they are made of, by name: ``model_mm``, ``model_deg``, ``hand_eye_mm``, ``hand_eye_deg``,
-            ``lag_frames``, and ``own_mm``, ``own_deg``: what photos have of their own, root mean square.
+            ``lag_frames``, ``focal_percent``, ``centre_percent`` (of the width), and ``own_mm``, ``own_deg``:
+            what photos have of their own, root mean square.
         with_depth: whether depth maps move with their photos, or stay where they are.
         intrinsics: of the photos' camera (see ``Camera.corrected``); depth keeps the written one.
     """

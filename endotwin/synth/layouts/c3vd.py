@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from endotwin.cameras import write_camera
 from endotwin.sequence.poses import write_c3vd_poses
 from endotwin.synth.job import Job
-from endotwin.synth.layouts.layout import CAMERA_WORDS, Layout, frame_name, write_camera, write_lines
+from endotwin.synth.layouts.layout import CAMERA_WORDS, Layout, frame_name, write_lines
 
 V1_NAMES = {"rgb": "color"}
 V2_FOLDERS = {"flow": "optical_flow", "occlusion": "occlusions"}
@@ -21,7 +22,7 @@ WORDS = {
 def _tables(folder: Path, job: Job) -> None:
     write_c3vd_poses(folder / "pose.txt", job.trajectory.T_world_camera)
     write_lines(folder / "timestamps.txt", [repr(float(s)) for s in job.trajectory.timestamps_s])
-    write_camera(folder, job.camera)
+    write_camera(folder / "camera.json", job.camera)
 
 
 V1 = Layout(

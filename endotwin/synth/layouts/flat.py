@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from endotwin.cameras import write_camera
 from endotwin.synth.encodings import depth_png
 from endotwin.synth.job import Job
 from endotwin.synth.layouts.layout import (
@@ -11,7 +12,6 @@ from endotwin.synth.layouts.layout import (
     Layout,
     frame_name,
     needs,
-    write_camera,
     write_lines,
 )
 
@@ -26,7 +26,7 @@ def _place(job: Job, index: int, image: str, suffix: str) -> str:
 def _tables(folder: Path, job: Job) -> None:
     pairs = [f"{LAYOUT.file(job, i, 'rgb')} {LAYOUT.file(job, i, 'depth')}" for i in range(len(job))]
     write_lines(folder / "filelist.txt", pairs)
-    write_camera(folder, job.camera)
+    write_camera(folder / "camera.json", job.camera)
 
 
 LAYOUT = Layout(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -69,11 +68,6 @@ def needs(*required: str) -> Callable[[Camera, tuple[str, ...]], str]:
 def frame_name(job: Job, index: int) -> str:
     """The frame's number, all of one length."""
     return f"{index:0{job.digits}d}"
-
-
-def write_camera(folder: Path, camera: Camera) -> None:
-    """``camera.json``."""
-    (folder / "camera.json").write_text(json.dumps(camera.to_dict(), indent=1) + "\n", encoding="utf-8")
 
 
 def write_lines(path: Path, lines: list[str]) -> None:

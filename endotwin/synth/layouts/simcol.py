@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from endotwin.cameras import Pinhole
+from endotwin.cameras import Pinhole, write_camera
 from endotwin.sequence.readers.simcol import DEPTH_FULL, DEPTH_RANGE_MM, MIRROR_Y, MM_PER_CM
 from endotwin.synth.encodings import depth_png
 from endotwin.synth.job import Job
@@ -17,7 +17,6 @@ from endotwin.synth.layouts.layout import (
     frame_name,
     needs,
     numbers,
-    write_camera,
     write_lines,
 )
 
@@ -35,7 +34,7 @@ def _tables(folder: Path, job: Job) -> None:
     positions_cm = poses[:, :3, 3] / MM_PER_CM
     write_lines(folder / "SavedPosition_S1.txt", [numbers(row) for row in positions_cm])
     write_lines(folder / "SavedRotationQuaternion_S1.txt", [numbers(row) for row in quaternions])
-    write_camera(folder / FRAMES, job.camera)
+    write_camera(folder / FRAMES / "camera.json", job.camera)
     if isinstance(job.camera, Pinhole):
         K = job.camera.matrix + np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
         write_lines(folder / "cam.txt", [numbers(row) for row in K])

@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from endotwin.cameras import Pinhole
+from endotwin.cameras import Pinhole, write_camera
 from endotwin.sequence.poses import MM_PER_UNIT
 from endotwin.synth.encodings import depth_png
 from endotwin.synth.job import Job
-from endotwin.synth.layouts.layout import CAMERA_WORDS, Layout, needs, numbers, write_camera, write_lines
+from endotwin.synth.layouts.layout import CAMERA_WORDS, Layout, needs, numbers, write_lines
 
 LEVELS_PER_MM = 5
 
@@ -40,7 +40,7 @@ def _tables(folder: Path, job: Job) -> None:
         f"{time} {row}" for time, row in zip(times, tum_rows(job.trajectory.T_world_camera), strict=True)
     ]
     write_lines(folder / "groundtruth.txt", ["# timestamp tx ty tz qx qy qz qw", *poses])
-    write_camera(folder, job.camera)
+    write_camera(folder / "camera.json", job.camera)
     if isinstance(job.camera, Pinhole) and not job.camera.distortion.any():
         camera = job.camera
         write_lines(folder / "calibration.txt", [numbers((camera.fx, camera.fy, camera.cx, camera.cy))])
