@@ -7,6 +7,7 @@ import trimesh
 
 from endotwin.cameras import Pinhole
 from endotwin.fusion.mesh import surface_of
+from endotwin.fusion.tube import tube_of
 from endotwin.fusion.views import View
 from endotwin.fusion.wall import EDGE, GAP, with_wall
 from endotwin.surface.casting import Caster
@@ -34,7 +35,7 @@ def towards_minus_x(surface, x_mm):
 
 
 def walled(surface, x_mm=0.0):
-    return with_wall(CAMERA, surface, [towards_minus_x(surface, x_mm)], MEDIAN_MM)
+    return with_wall(CAMERA, surface, towards_minus_x(surface, x_mm).T_world_camera[None], MEDIAN_MM)
 
 
 def met(surface):
@@ -70,6 +71,57 @@ def test_no_wall_shuts_a_camera_out_that_looks_in_from_outside(torn):
     surface, view = walled(torn, 1.3 * RADIUS_MM), towards_minus_x(torn, 1.3 * RADIUS_MM)
     assert hidden(walled(torn), view) > 0.5
     assert hidden(surface, view) == 0
+
+
+def strip(turn=0.9, folds=0.0):
+    """A strip along z of a tube of RADIUS_MM about the z axis, that turns by so much about it, with rings of
+    folds."""
+    z, angle = np.meshgrid(np.linspace(-15, 15, 121), np.linspace(-turn, turn, 61), indexing="ij")
+    reach = RADIUS_MM - folds * np.exp(-(((z - 7 * np.round(z / 7)) / 1.5) ** 2))
+    points = np.stack([reach * np.cos(angle), reach * np.sin(angle), z], axis=-1).reshape(-1, 3)
+    corner = np.arange(121 * 61).reshape(121, 61)
+    a, b, c, d = corner[:-1, :-1], corner[:-1, 1:], corner[1:, :-1], corner[1:, 1:]
+    triangles = np.stack([np.stack([a, c, b], -1), np.stack([d, b, c], -1)], axis=2).reshape(-1, 3)
+    return surface_of(np.zeros(3), points.astype(np.float32), triangles)
+
+
+@pytest.mark.parametrize("folds", [0.0, 1.5])
+def test_a_strip_of_a_tube_tells_its_axis_and_radius(folds):
+    tube = tube_of(strip(folds=folds))
+    assert abs(tube.axis[2]) > 0.999
+    assert tube.radius_mm == pytest.approx(RADIUS_MM, rel=0.02 if not folds else 0.1)
+    assert np.linalg.norm(tube.centre_mm[:2]) < 0.02 * RADIUS_MM + folds / 2
+    assert tube.holds(np.zeros((1, 3))) and not tube.holds(np.array([[-1.2 * RADIUS_MM, 0, 0]]))
+
+
+def test_points_of_a_tube_lie_on_it_and_its_round_ends_and_face_inside():
+    tube = tube_of(strip())
+    points_mm, normals = tube.points(np.array([[0, 0, -15.0], [0, 0, 15]]), 5.0, 1.0)
+    inner_mm = np.clip(points_mm[:, 2], -20, 20)[:, None] * [0, 0, 1]
+    np.testing.assert_allclose(np.linalg.norm(points_mm - inner_mm, axis=1), RADIUS_MM, rtol=0.02)
+    assert (np.einsum("pa,pa->p", normals, points_mm - inner_mm) / RADIUS_MM).max() < -0.97
+    assert 20 + 0.9 * RADIUS_MM < np.abs(points_mm[:, 2]).max() < 20 + 1.1 * RADIUS_MM
+
+
+def test_a_plane_and_a_ball_from_outside_are_no_tubes():
+    plane = trimesh.creation.box([30, 30, 0]).subdivide().subdivide().subdivide()
+    ball = trimesh.creation.icosphere(subdivisions=4, radius=RADIUS_MM)
+    facing = plane.face_normals[:, 2] > 0.5
+    for mesh, triangles in ((plane, plane.faces[facing]), (ball, ball.faces)):
+        assert tube_of(surface_of(np.zeros(3), np.asarray(mesh.vertices, np.float32), triangles)) is None
+
+
+def test_the_wall_of_a_strip_is_the_rest_of_its_tube():
+    """A camera on the axis looks at a strip; where it does not look, the lumen goes on around it."""
+    surface = strip()
+    pose = trimesh.transformations.rotation_matrix(np.pi / 2, [0, 1, 0])
+    walled = with_wall(CAMERA, surface, pose[None], RADIUS_MM)
+    middle_mm = walled.wall_mm[walled.wall_triangles].mean(axis=1)
+    around = middle_mm[np.abs(middle_mm[:, 2]) < 10]
+    reach_mm = np.linalg.norm(around[:, :2], axis=1)
+    assert np.quantile(np.abs(reach_mm / RADIUS_MM - 1), 0.9) < 0.05
+    turn = np.histogram(np.arctan2(around[:, 1], around[:, 0]), 12, (-np.pi, np.pi))[0]
+    assert (turn[[0, 1, 2, 9, 10, 11]] > 0).all()
 
 
 def hidden(surface, view):

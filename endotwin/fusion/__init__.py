@@ -136,7 +136,7 @@ def fuse(
     if seen is not None:
         others = [glance for glance in seen if glance.index in set(photo_frames) - set(photos)]
         surface = covered_by_glances(camera, surface, others, sequence.lens_mask, tolerance)
-    surface = with_wall(camera, surface, views("close the lumen", fused), median_mm)
+    surface = with_wall(camera, surface, np.asarray(sequence.T_world_camera)[fused], median_mm)
     if record is not None:
         record.update(fused=fused, nothing_new=len(frames) - len(fused))
     return surface
