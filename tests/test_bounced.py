@@ -9,7 +9,7 @@ from endotwin.fusion.mesh import surface_of
 from endotwin.light.bounced import GAMMA_STEP, Albedo, BouncedLight, Places
 from endotwin.light.forward import Lobes
 from endotwin.light.guides import AT_LENS, COSINE
-from endotwin.light.radiosity import BOUNCES, Radiosity
+from endotwin.light.radiosity import Radiosity
 from endotwin.surface.casting import Caster
 
 RADIUS_MM = 10.0
@@ -32,16 +32,16 @@ def sphere() -> tuple[BouncedLight, Places, Albedo]:
 
 
 def series(albedo: float) -> float:
-    """E/E_direct = ρ + ρ² + …, cut after BOUNCES terms (Ulbricht's integrating sphere)."""
-    return sum(albedo**k for k in range(1, BOUNCES + 1))
+    """E/E_direct = (ρ + ρ² + …)/2 of a light that faces half the sphere (Ulbricht's integrating sphere)."""
+    return albedo / (1 - albedo) / 2
 
 
 def test_base_color_and_gloss_both_send_light_back(sphere):
     light, places, albedo = sphere
     bounced = light.at(places, n=0.0, q=2.0, albedo=albedo.scaled(0.0))
-    np.testing.assert_allclose(bounced, series(BASE_COLOR + GLOSSY) / RADIUS_MM**2, rtol=0.03)
+    np.testing.assert_allclose(bounced, series(BASE_COLOR + GLOSSY) / RADIUS_MM**2, rtol=0.05)
     brighter = light.at(places, n=0.0, q=2.0, albedo=albedo.scaled(0.3))
-    np.testing.assert_allclose(brighter, series(BASE_COLOR * np.exp(0.3) + GLOSSY) / RADIUS_MM**2, rtol=0.03)
+    np.testing.assert_allclose(brighter, series(BASE_COLOR * np.exp(0.3) + GLOSSY) / RADIUS_MM**2, rtol=0.05)
 
 
 def test_one_view_is_as_one_of_several(sphere):

@@ -7,9 +7,8 @@ irradiance E under any light is E = K·ρ(E_direct + E), a few sparse products a
 
 A lumen is closed, and a mesh of what depth maps showed is not: from half of a wall's directions comes light
 of tissue that nobody saw. The surface's wall stands for it, with the albedo of the nearest patch that was
-seen; and where that ends too, tissue like that which is seen from there, in less light: UNSEEN_DIRECT of the
-direct irradiance (a light beside the camera hardly reaches what the camera does not see) and UNSEEN_INDIRECT
-of the indirect one.
+seen; and where that ends too, tissue like that which is seen from there, in as much indirect light, but only
+UNSEEN_DIRECT of the direct one: a light beside the camera hardly reaches what the camera does not see.
 """
 
 from __future__ import annotations
@@ -49,18 +48,14 @@ over an edge, are one with the nearest larger one."""
 LIFT = 1e-3
 """Rays start this share of a patch's size above it."""
 
-UNSEEN_DIRECT, UNSEEN_INDIRECT = 0.1, 0.8
-"""Against whole colons these bring the bounce from a mesh of what was seen from 36 % (red) and 65 % (green)
-of its strength to within 6 %, and halve its error from place to place, without any wall; beside one they
-leave it 3 to 8 % too strong. A convex hull about the mesh does worse."""
+UNSEEN_DIRECT = 0.1
 
 LEAST_SEEN = 0.1
 """Share of its directions that a patch must see something in for that to stand for the rest."""
 
-BOUNCES = 12
+BOUNCES = 6
 ALBEDO_MAX = 0.95
-"""With twelve bounces at most 0.95¹² = 54 % of an impossible furnace is missing; tissue (below 0.8) loses
-7 %."""
+"""Bounces one by one, before all that follow are taken for a geometric series."""
 
 
 @dataclass(frozen=True)
@@ -161,24 +156,23 @@ class Radiosity:
 
     def lamp(self, T_local_camera: np.ndarray, guide_mm: np.ndarray, profile: float) -> Lamp:
         """What a guide at ``guide_mm`` [3] (camera frame) of the pose [4, 4] lights, with the angular
-        shape ``profile`` (``guides.log_axis``)."""
+        shape ``profile`` (``guides.log_axis``): nothing behind it."""
         rotation = T_local_camera[:3, :3]
         source = (T_local_camera[:3, 3] + rotation @ guide_mm).astype(np.float32)
         ray = self._points_mm - source
         distance_mm = np.maximum(np.sqrt(dot(ray, ray)), DISTANCE_MIN_MM)
         ray = ray / distance_mm[:, None]
-        cos = -dot(ray, self._normals)
-        facing = np.flatnonzero(cos > 0)
+        cos, axis = -dot(ray, self._normals), ray @ rotation[:, 2].astype(np.float32)
+        facing = np.flatnonzero((cos > 0) & (axis > 0))
         own = np.searchsorted(facing, self.count * POINTS)
         seen = np.zeros(len(cos), bool)
         for caster, some in ((self._caster, facing[:own]), (self._whole, facing[own:])):
             length_mm = distance_mm[some] * (1 - SHADOW_BIAS)
             seen[some] = caster.unobstructed(np.broadcast_to(source, (len(some), 3)), ray[some], length_mm)
         shape = (-1, POINTS)
-        axis = np.maximum(ray @ rotation[:, 2].astype(np.float32), COS_MIN)
         return Lamp(
             cos=np.where(seen, cos, 0).astype(np.float32).reshape(shape),
-            log_axis=log_axis(axis, profile).astype(np.float32).reshape(shape),
+            log_axis=log_axis(np.maximum(axis, COS_MIN), profile).astype(np.float32).reshape(shape),
             log_distance=np.log(distance_mm).reshape(shape),
         )
 
@@ -201,11 +195,13 @@ class Radiosity:
             met = (self.form_factors @ radiosity).reshape(irradiance.shape)
             return met * (1 + unseen_share * unseen)
 
-        first = thrown(np.repeat(direct[..., None].astype(np.float32), 3, axis=2), UNSEEN_DIRECT)
-        bounced = first
+        added = thrown(np.repeat(direct[..., None].astype(np.float32), 3, axis=2), UNSEEN_DIRECT)
+        total = added.copy()
         for _ in range(BOUNCES - 1):
-            bounced = first + thrown(bounced, UNSEEN_INDIRECT)
-        return bounced[: self.count]
+            before, added = added.sum(axis=0), thrown(added, 1.0)
+            total += added
+        ratio = np.clip(added.sum(axis=0) / np.maximum(before, np.finfo(np.float32).tiny), 0, ALBEDO_MAX)
+        return (total + added * (ratio / (1 - ratio)))[: self.count]
 
     def mean(self, per_triangle: np.ndarray) -> np.ndarray:
         """Means over each patch's area, [P, C], of values [F, C]."""
