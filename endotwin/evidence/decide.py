@@ -28,7 +28,7 @@ from endotwin.effects.specular import Specular
 from endotwin.effects.vignetting import Vignetting
 from endotwin.evidence.bounce import bounced, cell_mm
 from endotwin.evidence.glints import Glints
-from endotwin.evidence.guide_search import Guides, found_guides, settled
+from endotwin.evidence.guide_search import Guides, Search, found_guides, settled
 from endotwin.evidence.log_light import Bounced
 from endotwin.evidence.probe import MIN_IMPOSSIBLE_DB, Fitted, Hypothesis, Probe, Verdict
 from endotwin.light.guides import AT_LENS, COSINE, EXPONENTIAL
@@ -129,7 +129,8 @@ class _Trial:
         return self._model(kept)
 
     def _seek_guides(self, best: frozenset[str]) -> None:
-        """Find the guides without and with bounced light, if there are any beside the best set without them.
+        """Find the guides without and with bounced light, if there are any beside the best set without them;
+        at last beside the bounce of their own light.
 
         Where bounced light is left out, a guide near the lens throws into the shadows what nothing else does.
         """
@@ -137,12 +138,16 @@ class _Trial:
         found_mm = found_guides(self._probe, base, self._glints(), self.wanted("offset") == "on")
         bounces = base.bounced is not None
         self._guides_mm = dict.fromkeys((False, True), found_mm)
-        if found_mm == AT_LENS or self.wanted("interreflection") != "auto" or self._late():
+        if found_mm == AT_LENS or self.wanted("interreflection") == "off" or self._late():
             return
-        other = replace(base, bounced=None if bounces else self._bouncing(AT_LENS))
-        other_mm = found_guides(self._probe, other, self._glints(), False)
-        if other_mm != AT_LENS:
-            self._guides_mm[not bounces] = other_mm
+        if self.wanted("interreflection") == "auto":
+            other = replace(base, bounced=None if bounces else self._bouncing(AT_LENS))
+            other_mm = found_guides(self._probe, other, self._glints(), False)
+            if other_mm != AT_LENS:
+                self._guides_mm[not bounces] = other_mm
+        own = Hypothesis(self._guides_mm[True], shadows=True, gain=base.gain)
+        own = replace(own, bounced=self._bouncing(own.guides_mm))
+        self._guides_mm[True] = Search.of(self._probe, own, self._glints()).polished()
 
     @property
     def _beside_lens(self) -> bool:
