@@ -1,5 +1,6 @@
 """Light, response and f0 from the variation within vertices, whatever the tissue's texture."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -12,6 +13,7 @@ from endotwin.evidence.coat import judged
 from endotwin.fit.gauss_newton import ROUGHNESS_RANGE, roughness_to_raw
 from endotwin.fit.model import Globals, predict
 from endotwin.fit.within import Varied, Within
+from endotwin.light.bounced import Bounce
 from endotwin.pixels.samples import Samples, Views
 from endotwin.twin import Light, Response
 
@@ -198,3 +200,32 @@ def test_under_a_coat_that_shines_a_clipped_photo_says_at_least():
     assert not len(seen(0.0, 120.0))
     assert len(seen(0.5, 120.0)) > 1000 and (seen(0.5, 120.0) > 0).all()
     assert not len(seen(0.5, 1e9))
+
+
+def test_beside_a_bounce_colours_tell_the_response_where_gains_swallow_all_that_is_grey():
+    """All of a frame is lit alike, so that its gain passes for its light; only how red that is remains."""
+    generator = np.random.default_rng(4)
+    true = replace(TRUE, vector=torch.cat([TRUE.vector, torch.zeros(1, dtype=torch.float64)]))
+    within, material = photographed()
+    frame, count = within.samples.frame.long(), len(within.samples)
+    material[:, :3] = material[:, :3].clamp_max(0.5)
+    tint = torch.tensor([0.6, 0.25, 0.15]) * torch.from_numpy(generator.uniform(0.05, 1, (SIGHTINGS, 1)))
+    log = torch.log(tint)[frame] - 2.2 * np.log(20.0)
+    none = torch.zeros(count)
+    bounce = Bounce(log, none, none, torch.ones(count, 3), torch.zeros(count, 3), none)
+    gain = torch.from_numpy(generator.normal(0, 0.2, SIGHTINGS))
+    even = {"cos": 0.5 + none, "sin2": 0.75 + none, "log_cos_axis": -0.2 + none}
+    views = Views(None, np.ones((1, 1), bool), np.arange(SIGHTINGS), np.tile(np.eye(4), (SIGHTINGS, 1, 1)))
+    samples = replace(within.samples, **even, log_distance=np.log(20.0) + none, bounce=bounce, views=views)
+    shown = predict(replace(samples, log_exposure=gain[frame]), material, true).numpy()
+    shown = shown + generator.normal(0, NOISE, shown.shape)
+    samples = replace(samples, color=torch.from_numpy(np.uint8(np.clip(shown, 0, 1) * 255 + 0.5)))
+    log_L0, n, q = true.log_light
+    start = Globals.of(Light(math.exp(log_L0), n, q), Response(0.5), f0=0.035, bounce=True)
+    exposure = torch.zeros(SIGHTINGS, dtype=torch.float64)
+    for _ in range(8):
+        lit = replace(within, samples=replace(samples, log_exposure=exposure[frame]))
+        found = lit.renewed(material, start, ("n", "q", "albedo scale"), NOISE, Varied(SIGHTINGS))
+        start, exposure = found.shared, exposure + torch.from_numpy(found.log_gain)
+    assert start.gamma == pytest.approx(true.gamma, rel=0.02)
+    np.testing.assert_allclose(exposure - exposure.mean(), gain - gain.mean(), atol=0.02)

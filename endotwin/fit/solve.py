@@ -38,7 +38,7 @@ from endotwin.fit.model import Globals, at_pixels
 from endotwin.fit.sparkle import sparkle
 from endotwin.fit.tilt import Tilter
 from endotwin.fit.unexplained import residual_warning
-from endotwin.fit.within import Renewed, Within
+from endotwin.fit.within import Renewed, Varied, Within
 from endotwin.light.film import Film
 from endotwin.light.shading import F0_DIELECTRIC, ROUGHNESS_TISSUE
 from endotwin.pixels.length_unit import unit_mm
@@ -62,6 +62,9 @@ LIGHT_PIXELS, LIGHT_STEPS = 400_000, 6
 HOLD_STEPS, BOUNCE_STEPS = 1, 10
 """Steps where light is bounced, and depends on the materials; before HOLD_STEPS the albedo's scale is
 held."""
+
+SETTLING = 2
+"""Steps of the materials under a light that was found beside a bounce."""
 
 WORSE, HALVINGS = 1.25, 2
 """A step under whose light the photos cost so many times what they did is too long, and halved so often."""
@@ -286,12 +289,14 @@ def _find_light(
         if relighting.bounces and too_dark(state):
             state, steps = relighting.without_bounce(solver, state), number + LIGHT_STEPS
         elif relighting.bounces and number > coat_step:
-            best = _better(best, solver, state)
+            best = _better(best, solver, state, relighting.effects)
         pace.report("find the light", number, steps)
         if abs(gain) < CONVERGED * solver.cost(state, solver.noise(state)):
             number = max(number, coat_step) if judged is None else steps
     if relighting.bounces and best is not None:
-        state = best.state
+        held = (*start.undetermined, *BOUNCE_HELD, "albedo scale")
+        best = _by_what_varies(best, held, solver, surface, relighting, pace)
+        state, relighting.effects = best.state, best.effects
         relighting(solver, state)
     cost = _Cost(ready - began, step_s, len(points) * len(operator.cells_mm), len(samples))
     return state, cost, judged or Decision("off", "no time to judge")
@@ -299,18 +304,51 @@ def _find_light(
 
 @dataclass(frozen=True)
 class _Best:
-    """A ``state`` that costs least under its own light, by the ``noise`` at which others are held to it."""
+    """A ``state``, with the ``effects`` that were found with it, that costs least under its own light, by the
+    ``noise`` at which others are held to it."""
 
     state: State
+    effects: Effects
     cost: float
     noise: float
 
 
-def _better(best: _Best | None, solver: GaussNewton, state: State) -> _Best:
+def _better(best: _Best | None, solver: GaussNewton, state: State, effects: Effects) -> _Best:
     """``state``, by which the samples of ``solver`` are lit, or the ``best`` so far if that costs less."""
     noise = solver.noise(state) if best is None else best.noise
     cost = solver.cost(state, noise)
-    return best if best is not None and best.cost <= cost else _Best(state, cost, noise)
+    return best if best is not None and best.cost <= cost else _Best(state, effects, cost, noise)
+
+
+def _by_what_varies(
+    best: _Best,
+    held: tuple[str, ...],
+    solver: GaussNewton,
+    surface: Surface,
+    relighting: Relighting,
+    pace: Pace,
+) -> _Best:
+    """Light and response by what varies within vertices, beside a bounce of the strength that was found with
+    coarse albedo, for as long as all pixels say that it is better: coarse albedo bends γ, and what a video
+    processor does to colours bends what varies."""
+    varied = Varied(relighting.varied.frames)
+    relighting.effects = best.effects
+    relighting(solver, best.state)
+    for _ in range(LIGHT_STEPS):
+        if pace.light_is_over():
+            break
+        material = at_pixels(solver.samples, solver.triangles, best.state.materials)
+        within = Within.of(solver.samples, surface, unit_mm(surface))
+        found = within.renewed(material, best.state.shared, held, best.noise, varied)
+        relighting.brighten(solver, found.log_gain)
+        state = replace(best.state, shared=found.shared)
+        for _ in range(SETTLING):
+            state, _ = _stepped(solver, state, relighting, joint=False)
+        newer = _better(best, solver, state, relighting.effects)
+        if newer is best:
+            break
+        best = newer
+    return best
 
 
 def _stepped(solver: GaussNewton, state: State, relighting: Relighting, joint: bool) -> tuple[State, float]:

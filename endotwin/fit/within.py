@@ -4,6 +4,9 @@ Each vertex has an albedo that nobody knows. In log C that is an intercept of it
 vertex's mean takes it out exactly: what is left varies with distance, angle and frame only. Unlike a fit
 beside smooth albedo features, no texture can pass for shading, whatever those features cannot follow.
 
+Where light bounces, the ratios of a vertex's channels vary, too: tissue throws red light on tissue, and by
+how much of it a place has the response is told from the light. Each ratio has an intercept of its own.
+
 The gain of a frame is an intercept, too. A camera that comes nearer turns its gain down, so that gains pass
 for most of the fall-off: found in turns with it, they would stay where they were first guessed. So would
 guides, whose places pass for the light's exponents.
@@ -35,7 +38,7 @@ from endotwin.fit.model import Globals, linearise, predict
 from endotwin.light import shading
 from endotwin.pixels.fixed_effects import Design, regress
 from endotwin.pixels.samples import Samples
-from endotwin.pixels.start import BRIGHT, DIFFUSE_SIN2
+from endotwin.pixels.start import BRIGHT, DARK, DIFFUSE_SIN2
 from endotwin.surface import Surface
 
 DARKEST = 0.03
@@ -43,6 +46,12 @@ DARKEST = 0.03
 
 MODEL_ERROR = 0.02
 """Relative error of a prediction whose noise is 0: normals, albedo within a vertex's cell."""
+
+RATIO_ERROR = 0.004
+"""That of a ratio of channels: what a normal or a distance errs by is alike in all of them."""
+
+RATIOS = torch.tensor([[1.0, -1.0, 0.0], [0.5, 0.5, -1.0]], dtype=torch.float64)
+"""Red to green, and both to blue, of the channels' logarithms."""
 
 COAT_SPREAD = 2.0
 """Standard deviation of a coat's weight about 0: tissue is wet, not lacquered."""
@@ -109,6 +118,11 @@ class Sightings:
     by_guides: np.ndarray
     weight: np.ndarray
 
+    def beside(self, other: Sightings) -> Sightings:
+        """These, and then those of ``other``."""
+        pairs = zip(vars(self).items(), vars(other).values(), strict=True)
+        return Sightings(**{name: np.concatenate([mine, theirs]) for (name, mine), theirs in pairs})
+
 
 @dataclass(frozen=True)
 class Within:
@@ -130,8 +144,8 @@ class Within:
     def renewed(
         self, material: Tensor, shared: Globals, held: tuple[str, ...], noise: float, varied: Varied = STILL
     ) -> Renewed:
-        """A Gauss–Newton step: light, response and what is ``varied`` by what is off the highlights, then f0
-        and the coat by all.
+        """A Gauss–Newton step: light, response and what is ``varied`` by what is off the highlights, then,
+        where no light bounces, f0 and the coat by all.
 
         How diffuse light falls off towards grazing says most of γ, and the lobe that tissue really has is
         nobody's: off the highlights its shape, which Burley's roughness sets, is found beside them and left.
@@ -141,8 +155,9 @@ class Within:
                 values.
         """
         diffuse = self.samples.sin2 > DIFFUSE_SIN2
-        found = self._step(material, shared, (*held, "level", "f0"), diffuse, noise, varied)
-        if not shared.specular:
+        level = "L0" if shared.bounces else "level"
+        found = self._step(material, shared, (*held, level, "f0"), diffuse, noise, varied)
+        if not shared.specular or shared.bounces:
             return found
         shone = self.shone(material, found.shared, noise)
         return replace(found, shared=shone.shared, roughness=shone.roughness)
@@ -186,11 +201,14 @@ class Within:
         seen = self.sightings(material, shared, chosen, noise, varied)
         if not free.shape[1] or len(seen.residual) < LEAST_SIGHTINGS:
             return Renewed(shared, np.zeros(varied.frames), np.zeros((varied.guides, 3)))
-        frame = np.searchsorted(self.samples.views.frames, seen.frame) if varied.frames else None
         diffuse = "f0" in held
+        count = self.count
+        if diffuse and shared.bounces:
+            seen, count = seen.beside(self._ratios(material, shared, chosen, noise)), 3 * count
+        frame = np.searchsorted(self.samples.views.frames, seen.frame) if varied.frames else None
         coated = not diffuse and shared.coat is not None
         columns, prior = self._columns(seen, shared, free, diffuse, coated)
-        design = Design(columns, seen.vertex, self.count, frame, seen.weight, prior)
+        design = Design(columns, seen.vertex, count, frame, seen.weight, prior)
         found = regress(seen.residual, design, varied.frames, rounds=REWEIGHTS)
         count, guides = free.shape[1], seen.by_guides.shape[1]
         along, places, shine = np.split(found.coefficients, [count, count + guides])
@@ -269,12 +287,41 @@ class Within:
         by_raw = roughness_slope(material[rows, 3])[:, None]
         by_roughness = (model.by_roughness[bright] * by_raw * tells).mean(dim=1).numpy() / predicted
         weight = 1 / ((noise / predicted) ** 2 + MODEL_ERROR**2)
+        columns = (residual, by_roughness, by_coat, *slopes.T, *by_guides)
+        return self._gathered(rows, columns, weight, slopes.shape[1])
+
+    def _ratios(self, material: Tensor, shared: Globals, chosen: Tensor, noise: float) -> Sightings:
+        """Sightings of the RATIOS of channels of the ``chosen`` samples in which none is dark or clipped, as
+        vertices of their own; no gain changes them: they are of the first frame."""
+        shown = self.samples.color
+        rows = torch.nonzero(chosen & (shown.amin(dim=1) > DARK) & (shown.amax(dim=1) < BRIGHT))[:, 0]
+        model = linearise(self.samples[rows], material[rows], shared)
+        bright = (model.predicted > DARKEST).all(dim=1)
+        rows, predicted = rows[bright], model.predicted[bright].double()
+        residual = torch.log(shown[rows].double() / 255) - torch.log(predicted)
+        slopes = model.by_globals[bright].double() / predicted[..., None]
+        by_raw = roughness_slope(material[rows, 3])[:, None]
+        by_roughness = model.by_roughness[bright] * by_raw / predicted
+        found = []
+        for number, ratio in enumerate(RATIOS, start=1):
+            by_shared = (ratio @ slopes).T.numpy()
+            columns = ((residual @ ratio).numpy(), (by_roughness @ ratio).numpy(), np.zeros(len(rows)))
+            variance = (noise / predicted) ** 2 @ ratio**2 + RATIO_ERROR**2
+            each = self._gathered(rows, (*columns, *by_shared), 1 / variance.numpy(), len(by_shared))
+            first = np.full_like(each.frame, self.samples.views.frames[0])
+            found.append(replace(each, vertex=each.vertex + number * self.count, frame=first))
+        return found[0].beside(found[1])
+
+    def _gathered(
+        self, rows: Tensor, columns: tuple[np.ndarray, ...], weight: np.ndarray, count: int
+    ) -> Sightings:
+        """Sightings of samples ``rows``: means of residual, slopes by roughness and coat, by ``count`` shared
+        parameters and by guides, each [R]."""
         place = self.vertex[rows.numpy()].astype(np.int64) << 32 | self.samples.frame[rows].numpy()
         place, which = np.unique(place, return_inverse=True)
         total = np.bincount(which, weight, len(place))
-        averaged = (residual, by_roughness, by_coat, *slopes.T, *by_guides)
-        means = [np.bincount(which, weight * column, len(place)) / total for column in averaged]
-        slopes, by_guides = np.split(np.stack(means[3:], axis=1), [slopes.shape[1]], axis=1)
+        means = [np.bincount(which, weight * column, len(place)) / total for column in columns]
+        slopes, by_guides = np.split(np.stack(means[3:], axis=1), [count], axis=1)
         frame = (place & 0xFFFFFFFF).astype(np.int32)
         return Sightings(place >> 32, frame, means[0], slopes, *means[1:3], by_guides, total)
 
