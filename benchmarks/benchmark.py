@@ -42,10 +42,14 @@ def run(*arguments: object, profile: Path) -> tuple[str, float, dict]:
 
 
 def material_errors(twin: Twin, truth: Path) -> tuple[float, float]:
-    """RMSE of albedo, after one global scale, and of roughness, over covered pixels of frames with truth."""
+    """RMSE of albedo, after one global scale, and of roughness, over covered pixels of frames with truth; NaN
+    without any."""
+    files = sorted(truth.glob("*_albedo.png"))
+    if not files:
+        return float("nan"), float("nan")
     sequence, renderer = twin.source.open(), Renderer(twin)
     fitted_albedo, true_albedo, fitted_roughness, true_roughness = [], [], [], []
-    for file in sorted(truth.glob("*_albedo.png")):
+    for file in files:
         frame = sequence.frame(int(file.name.split("_")[0]))
         valid = sequence.lens_mask & np.isfinite(frame.depth_mm)
         view = renderer.view(frame.T_world_camera, valid)
@@ -79,6 +83,13 @@ def true_light(made: dict) -> dict[str, float]:
     return {"gamma": made.get("gamma", GAMMA), "n": light["n"], "q": light["q"]}
 
 
+def aligned(twin: Twin) -> str:
+    """Seconds that alignment took, and whether it moved anything."""
+    record = twin.record.get("align")
+    moved = ", moved" if twin.registration is not None else ""
+    return "-" if record is None else f"{record['seconds']:.1f} s{moved}"
+
+
 def percent(value: float, true: float) -> str:
     """Relative error as a signed percentage."""
     return f"{100 * (value / true - 1):+.1f} %"
@@ -107,6 +118,7 @@ def benchmark(
         "geometry": options.geometry,
         "fuse": f"{fuse_s:.1f} s",
         "fit": f"{fit_s:.1f} s",
+        "of it align": aligned(twin),
         "fuse + fit": f"{fuse_s + fit_s:.1f} s",
         "eval": f"{eval_s:.1f} s",
         "peak memory": f"{max(fuse['peak_memory_mb'], fit['peak_memory_mb']) / 1000:.2f} GB",

@@ -88,31 +88,22 @@ PROTOCOLS = {
     "ten": Protocol("the ten scenes of EndoGSLAM and PR-ENDO, as photographed", sequences=TEN),
 }
 
-COLUMNS = (
-    "sequence",
-    "frames",
-    "fused",
-    "fuse",
-    "align",
-    "fit",
-    "memory",
-    "PSNR",
-    "SSIM",
-    "LPIPS",
-    "LPIPS VGG",
-    "PSNR covered",
-)
-COLUMNS += ("covered", "note")
-
 SCORES = (
     ("PSNR", "psnr", 2),
     ("SSIM", "ssim", 3),
     ("LPIPS", "lpips", 3),
     ("LPIPS VGG", "lpips_vgg", 3),
     ("PSNR covered", "psnr_covered", 2),
+    ("PSNR dull", "psnr_dull", 2),
+    ("recall", "recall", 2),
+    ("precision", "precision", 2),
     ("covered", "covered", 4),
 )
-"""Columns of scores, their names in a row, and their digits."""
+"""Columns of scores, their names in a row, and their digits; dull is what is off highlights, which recall and
+precision are of."""
+
+COLUMNS = ("sequence", "frames", "fused", "fuse", "align", "fit", "memory")
+COLUMNS += (*(column for column, _, _ in SCORES), "note")
 
 
 def found(root: Path) -> dict[str, Path]:

@@ -14,7 +14,8 @@ import endotwin
 from endotwin.config import FitConfig
 from endotwin.evaluation.evaluation import covered_pixels
 from endotwin.fit import fit
-from endotwin.fit.solve import median_edge_mm, proxies
+from endotwin.fit.light_stage import proxies
+from endotwin.fit.solve import median_edge_mm
 from endotwin.pixels.pace import Pace
 from endotwin.pixels.samples import gather
 from endotwin.surface.casting import Caster

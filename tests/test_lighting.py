@@ -13,9 +13,9 @@ from endotwin.effects.offset import Offset
 from endotwin.effects.shadows import Shadows
 from endotwin.effects.specular import Specular
 from endotwin.fit.gauss_newton import GaussNewton
+from endotwin.fit.light_stage import STEPS
 from endotwin.fit.lighting import Relighting, lit
 from endotwin.fit.model import at_pixels
-from endotwin.fit.solve import LIGHT_STEPS
 from endotwin.fit.within import Within
 from endotwin.light.bounced import Bounce
 from endotwin.surface.casting import Caster
@@ -81,7 +81,7 @@ def test_a_guide_that_casts_no_shadow_is_found_behind_the_lens_from_a_millimetre
     samples = lit(samples, twin.surface, caster, aside)
     solver = GaussNewton(samples, twin.surface.triangles, state.operator)
     shared = replace(state.shared, vector=state.shared.vector * torch.tensor([1, 1.1, 0.95, 1.05, 1.0]))
-    for _ in range(LIGHT_STEPS):
+    for _ in range(STEPS):
         within = Within.of(solver.samples, twin.surface, 1.0)
         material = at_pixels(solver.samples, solver.triangles, state.materials)
         found = within.renewed(material, shared, (), 1 / 255, relighting.varied)

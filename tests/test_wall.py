@@ -4,6 +4,8 @@ it shows."""
 import numpy as np
 import pytest
 import trimesh
+from independent.colon import LENGTH, Colon
+from independent.wall import Wall
 
 from endotwin.cameras import Pinhole
 from endotwin.fusion.mesh import surface_of
@@ -92,6 +94,19 @@ def test_a_strip_of_a_tube_tells_its_axis_and_radius(folds):
     assert tube.radius_mm == pytest.approx(RADIUS_MM, rel=0.02 if not folds else 0.1)
     assert np.linalg.norm(tube.centre_mm[:2]) < 0.02 * RADIUS_MM + folds / 2
     assert tube.holds(np.zeros((1, 3))) and not tube.holds(np.array([[-1.2 * RADIUS_MM, 0, 0]]))
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_side_of_a_random_colon_tells_its_radius(seed):
+    """Folds, bumps and bends are no part of it. Three fifths of the girth are there, over three radii."""
+    colon = Colon.draw(np.random.default_rng(seed))
+    rows, columns = colon.points_mm.shape[:2]
+    length = int(rows * 3 / LENGTH)
+    side = Wall(colon.points_mm[(rows - length) // 2 : (rows + length) // 2])
+    ahead = (side.triangles % columns).max(axis=1) < 0.6 * columns
+    middle_mm = side.vertices_mm.mean(axis=0)
+    tube = tube_of(surface_of(np.zeros(3), side.vertices_mm - middle_mm, side.triangles[ahead]))
+    assert tube.radius_mm == pytest.approx(colon.radius_mm, rel=0.1)
 
 
 def test_points_of_a_tube_lie_on_it_and_its_round_ends_and_face_inside():

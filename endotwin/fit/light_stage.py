@@ -1,0 +1,291 @@
+"""The light's stage: light, response and f0 beside coarse materials.
+
+In turns with the materials, light is found by what varies within vertices (``within``). Where it bounces, it
+depends on the materials, so that both are found in one step; what varies has the last word there, too.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+
+from endotwin.effects import Decision, Effects
+from endotwin.evidence.coat import judged as judged_coat
+from endotwin.fit.gauss_newton import (
+    GaussNewton,
+    State,
+    as_bouncing,
+    halfway,
+    roughness_to_raw,
+    too_dark,
+    without_furnace,
+)
+from endotwin.fit.hashgrid import HashGrid, HashOperator
+from endotwin.fit.lighting import Relighting
+from endotwin.fit.model import Globals, at_pixels
+from endotwin.fit.within import Renewed, Varied, Within
+from endotwin.light.shading import F0_DIELECTRIC, ROUGHNESS_TISSUE
+from endotwin.pixels.length_unit import unit_mm
+from endotwin.pixels.pace import LIGHT, Pace
+from endotwin.pixels.samples import Samples
+from endotwin.pixels.start import Start
+from endotwin.surface import Surface
+
+CELL_MM, COARSEST_MM = 1.6, 12.0
+"""Cells of the features beside which light and response are found, in units of the scene."""
+
+PROXIES = 4
+"""Vertices are merged to so many points a finest cell."""
+
+STEPS, BOUNCE_STEPS = 6, 10
+"""Steps, and those where light bounces."""
+
+HOLD_STEPS = 1
+"""Before these the scale of the albedo, which tells how light bounces, is held."""
+
+COAT_STEP, BOUNCE_COAT_STEP = 2, 4
+"""A coat that nobody asked for is judged when light and materials are near."""
+
+BOUNCE_HELD = ("q", "L0")
+"""Where light bounces, q stays where the fit starts, at the inverse square of a small light: what the bounce
+off a mesh errs by would bend it, and γ with it. L0 is told by the albedo's scale."""
+
+WORSE, HALVINGS = 1.25, 2
+"""A step under whose light the photos cost so many times what they did is too long, and halved so often."""
+
+SETTLING = 2
+"""Steps of the materials under a light that was found beside a bounce."""
+
+CONVERGED = 2e-4
+"""A step that changes the cost by a smaller share than this is the last."""
+
+
+@dataclass(frozen=True)
+class Cost:
+    """What the stage took, from which to tell what the detail's will.
+
+    Attributes:
+        setup_s, step_s: seconds of the operator and the solver, and of a step without the light.
+        weights: hash weights of its points. pixels: samples that the step summed over.
+    """
+
+    setup_s: float
+    step_s: float
+    weights: int
+    pixels: int
+
+
+@dataclass(frozen=True)
+class Best:
+    """A ``state``, with the ``effects`` that were found with it, that costs least under its own light, by the
+    ``noise`` at which others are held to it."""
+
+    state: State
+    effects: Effects
+    cost: float
+    noise: float
+
+
+class LightStage:
+    """One search for light, response, f0 and coarse materials.
+
+    Args:
+        samples: that tell the light. clipped: those that only say 'at least', to which a coat is held, too.
+        coat: whether there is one: auto, on or off.
+    """
+
+    def __init__(
+        self,
+        samples: Samples,
+        clipped: Samples,
+        surface: Surface,
+        start: Start,
+        pace: Pace,
+        relighting: Relighting,
+        coat: str,
+        device: torch.device,
+    ):
+        self._clipped, self._surface, self._pace, self._coat = clipped, surface, pace, coat
+        self._relighting, self._undetermined = relighting, start.undetermined
+        self._unit_mm = unit_mm(surface)
+        points, group = proxies(surface.vertices_mm, self._unit_mm * CELL_MM / PROXIES)
+        began = pace.stopwatch.total
+        grid = HashGrid(self._unit_mm * COARSEST_MM, self._unit_mm * CELL_MM)
+        operator = HashOperator.of(points, grid)
+        triangles = group[surface.triangles]
+        self._solver = GaussNewton(
+            samples, triangles, operator, self._unit_mm, out_of_time=pace.light_is_over, device=device
+        )
+        self._state = _started(operator, start, relighting)
+        relighting(self._solver, self._state)
+        self._judged: Decision | None = None
+        ready = pace.stopwatch.total
+        self._state, _ = self._stepped(self._state, joint=False)
+        step_s = pace.stopwatch.total - ready
+        self._cost = Cost(ready - began, step_s, len(points) * len(operator.cells_mm), len(samples))
+
+    def found(self) -> tuple[State, Cost, Decision]:
+        """The state, what it cost, and whether there is a coat."""
+        if self._relighting.bounces:
+            self._in_one_step()
+        if not self._relighting.bounces:
+            self._in_turns()
+        return self._state, self._cost, self._judged or Decision("off", "no time to judge")
+
+    def _in_turns(self) -> None:
+        """Light by what varies within vertices, then the materials, then light again."""
+        number = 0
+        while number < STEPS:
+            late = self._late
+            if late and number:
+                break
+            shared = self._coated() if self._judges(number, COAT_STEP) else self._state.shared
+            within, material, noise = self._within()
+            found = within.renewed(material, shared, self._undetermined, noise, self._relighting.varied)
+            self._relighting.vary(self._solver, found)
+            self._take(found)
+            if late:
+                break
+            self._state, gain = self._stepped(self._state, joint=False)
+            number = self._next(number, STEPS, gain, COAT_STEP)
+
+    def _in_one_step(self) -> None:
+        """Light and materials in one step, for the strength of the bounce; then light by what varies. Ends
+        early where photos show no bounce."""
+        number, best = 0, None
+        while number < BOUNCE_STEPS and not self._late:
+            shared = self._coated() if self._judges(number, BOUNCE_COAT_STEP) else self._state.shared
+            scale = ("albedo scale",) * (number < HOLD_STEPS)
+            self._solver.held = (*self._undetermined, *BOUNCE_HELD, *scale)
+            within, material, noise = self._within()
+            self._take(within.shone(material, shared, noise) if shared.coat else Renewed(shared))
+            self._state, gain = self._stepped(self._state, joint=True)
+            if too_dark(self._state):
+                self._state = self._relighting.without_bounce(self._solver, self._state)
+                return
+            if number >= BOUNCE_COAT_STEP:
+                best = self._better(best, self._state)
+            number = self._next(number, BOUNCE_STEPS, gain, BOUNCE_COAT_STEP)
+        if best is not None:
+            self._take_best(self._by_what_varies(best))
+
+    def _by_what_varies(self, best: Best) -> Best:
+        """Light and response by what varies within vertices, beside a bounce of the strength that was found,
+        for as long as all pixels say that it is better: coarse albedo bends γ, and what a video processor
+        does to colours bends what varies."""
+        held = (*self._undetermined, *BOUNCE_HELD, "albedo scale")
+        varied = Varied(self._relighting.varied.frames)
+        self._take_best(best)
+        for _ in range(STEPS):
+            if self._pace.light_is_over():
+                break
+            within, material, _ = self._within()
+            found = within.renewed(material, self._state.shared, held, best.noise, varied)
+            self._relighting.brighten(self._solver, found.log_gain)
+            self._take(found)
+            for _ in range(SETTLING):
+                self._state, _ = self._stepped(self._state, joint=False)
+            newer = self._better(best, self._state)
+            if newer is best:
+                break
+            best = newer
+        return best
+
+    @property
+    def _late(self) -> bool:
+        return self._pace.left(LIGHT) <= 2 * self._cost.step_s
+
+    def _within(self) -> tuple[Within, torch.Tensor, float]:
+        """The pixels by vertex, their materials, and the noise that is left."""
+        samples, triangles = self._solver.samples, self._solver.triangles
+        material = at_pixels(samples, triangles, self._state.materials)
+        return Within.of(samples, self._surface, self._unit_mm), material, self._solver.noise(self._state)
+
+    def _take(self, found: Renewed) -> None:
+        mean = self._state.mean + torch.tensor([0.0, 0.0, 0.0, found.roughness])
+        self._state = replace(self._state, shared=found.shared, mean=mean)
+
+    def _take_best(self, best: Best) -> None:
+        self._state, self._relighting.effects = best.state, best.effects
+        self._relighting(self._solver, self._state)
+
+    def _next(self, number: int, steps: int, gain: float, coat_step: int) -> int:
+        """The number of the step that follows: where this one changed the cost by hardly anything (``gain``),
+        that of the coat, or none."""
+        self._pace.report("find the light", number + 1, steps)
+        if abs(gain) >= CONVERGED * self._solver.cost(self._state, self._solver.noise(self._state)):
+            return number + 1
+        return max(number + 1, coat_step) if self._judged is None else steps
+
+    def _judges(self, number: int, coat_step: int) -> bool:
+        return self._judged is None and number == (0 if self._coat == "on" else coat_step)
+
+    def _coated(self) -> Globals:
+        """Light and response with the coat that highlights call for, clipped ones included."""
+        solver, state, relighting = self._solver, self._state, self._relighting
+        under = relighting.relit(relighting.guided(self._clipped), solver.triangles, state)
+        shiny = Samples.joined([solver.samples, under], solver.samples.views)
+        material = at_pixels(shiny, solver.triangles, state.materials)
+        seen = Within.of(shiny, self._surface, self._unit_mm)
+        highlights = seen.highlights(material, state.shared, solver.noise(state))
+        layer, self._judged = judged_coat(highlights, self._coat)
+        return replace(state.shared, coat=layer)
+
+    def _better(self, best: Best | None, state: State) -> Best:
+        """``state``, by which the samples are lit, or the ``best`` so far if that costs less."""
+        noise = self._solver.noise(state) if best is None else best.noise
+        cost = self._solver.cost(state, noise)
+        if best is not None and best.cost <= cost:
+            return best
+        return Best(state, self._relighting.effects, cost, noise)
+
+    def _stepped(self, state: State, joint: bool) -> tuple[State, float]:
+        """A step, of the materials alone where a ``joint`` one finds nothing lower, with the samples relit by
+        what it has found; and by how much the cost fell (below 0: it rose).
+
+        A step knows what it does to bounced light to first order. Where that was too far, it goes half the
+        way.
+        """
+        solver, relighting = self._solver, self._relighting
+        found = solver.step(state, joint, gains=joint and "gain" in relighting.effects)
+        if joint and not found.fell:
+            found = solver.step(state, joint=False)
+        relighting.brighten(solver, found.log_gain)
+        moved = found.state
+        if not relighting.bounces:
+            relighting(solver, moved)
+            return moved, found.fell
+        if not joint:
+            moved = as_bouncing(moved, state)
+        noise = solver.noise(state)
+        before = solver.cost(state, noise)
+        for halving in range(HALVINGS + 1):
+            moved = without_furnace(moved)
+            relighting(solver, moved)
+            after = solver.cost(moved, noise)
+            if after <= WORSE * before or halving == HALVINGS:
+                break
+            moved = halfway(state, moved)
+        return moved, before - after
+
+
+def _started(operator: HashOperator, start: Start, relighting: Relighting) -> State:
+    """Even tissue under the light of ``start``."""
+    shown = torch.from_numpy(start.base_color) ** start.response.gamma
+    mean = torch.cat([shown.median(dim=0).values, torch.tensor([roughness_to_raw(ROUGHNESS_TISSUE)])])
+    options = {"specular": "specular" in relighting.effects, "bounce": relighting.bounces}
+    shared = Globals.of(start.light, start.response, F0_DIELECTRIC, **options)
+    return State(operator, mean, torch.zeros(operator.forward_csr.shape[1], 4), shared)
+
+
+def proxies(vertices_mm: np.ndarray, cell_mm: float) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices [V, 3] merged by cells of edge ``cell_mm``: mean points float32 [P, 3], and the point of each
+    vertex [V].
+    """
+    cells = np.floor(vertices_mm / cell_mm).astype(np.int64)
+    _, group, count = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
+    group = group.reshape(-1)
+    sums = [np.bincount(group, vertices_mm[:, axis]) for axis in range(3)]
+    return (np.stack(sums, axis=1) / count[:, None]).astype(np.float32), group
