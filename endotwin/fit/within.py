@@ -202,16 +202,16 @@ class Within:
         if not free.shape[1] or len(seen.residual) < LEAST_SIGHTINGS:
             return Renewed(shared, np.zeros(varied.frames), np.zeros((varied.guides, 3)))
         diffuse = "f0" in held
-        count = self.count
+        places = self.count
         if diffuse and shared.bounces:
-            seen, count = seen.beside(self._ratios(material, shared, chosen, noise)), 3 * count
+            seen, places = seen.beside(self._ratios(material, shared, chosen, noise)), 3 * places
         frame = np.searchsorted(self.samples.views.frames, seen.frame) if varied.frames else None
         coated = not diffuse and shared.coat is not None
         columns, prior = self._columns(seen, shared, free, diffuse, coated)
-        design = Design(columns, seen.vertex, count, frame, seen.weight, prior)
+        design = Design(columns, seen.vertex, places, frame, seen.weight, prior)
         found = regress(seen.residual, design, varied.frames, rounds=REWEIGHTS)
         count, guides = free.shape[1], seen.by_guides.shape[1]
-        along, places, shine = np.split(found.coefficients, [count, count + guides])
+        along, aside_mm, shine = np.split(found.coefficients, [count, count + guides])
         along, (rougher, wetter) = free @ along, shine if coated else (0.0, 0.0)
         spread = np.r_[global_prior(self.unit_mm, len(shared.vector))[1].numpy(), ROUGHNESS_LOGIT_SPREAD]
         length = min(1.0, float((spread / np.maximum(np.abs(np.r_[along, rougher]), 1e-12)).min()))
@@ -220,7 +220,7 @@ class Within:
             shared = replace(shared, coat=replace(shared.coat, weight=weight))
         log_gain = found.intercepts / shared.gamma if varied.frames else np.zeros(0)
         moved = bounded(shared, shared.vector + torch.from_numpy(length * along))
-        return Renewed(moved, length * log_gain, length * places.reshape(-1, 3), length * float(rougher))
+        return Renewed(moved, length * log_gain, length * aside_mm.reshape(-1, 3), length * float(rougher))
 
     def _columns(
         self, seen: Sightings, shared: Globals, free: np.ndarray, diffuse: bool, coated: bool

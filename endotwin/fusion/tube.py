@@ -41,15 +41,14 @@ class Tube:
         low_mm, high_mm = along_mm.min() - beyond_mm, along_mm.max() + beyond_mm
         angle = np.arange(0.5 * spacing_mm / self.radius_mm, np.pi / 2, spacing_mm / self.radius_mm)
         middle_mm = np.arange(low_mm, high_mm, spacing_mm)
-        ends = -np.cos(angle), np.zeros(len(middle_mm)), np.cos(angle)
-        slope = np.concatenate(ends)
+        slope = np.concatenate([-np.cos(angle), np.zeros(len(middle_mm)), np.cos(angle)])
         start_mm = np.concatenate([np.full(len(angle), low_mm), middle_mm, np.full(len(angle), high_mm)])
-        found = []
+        across, found = _across(self.axis), []
         for at_mm, sine in zip(start_mm, slope, strict=True):
             cosine = np.sqrt(1 - sine * sine)
             count = max(3, round(2 * np.pi * self.radius_mm * cosine / spacing_mm))
             turn = 2 * np.pi * np.arange(count) / count
-            outward = cosine * np.stack([np.cos(turn), np.sin(turn)], axis=1) @ _across(self.axis).T
+            outward = cosine * np.stack([np.cos(turn), np.sin(turn)], axis=1) @ across.T
             outward = outward + sine * self.axis
             found.append((self.centre_mm + at_mm * self.axis + self.radius_mm * outward, -outward))
         points_mm, normals = (np.concatenate(each).astype(np.float32) for each in zip(*found, strict=True))

@@ -44,6 +44,9 @@ CLEAR = 3.0
 REACH = 2.0
 """Radii by which the tube goes on beyond surface and cameras, before its round ends."""
 
+FINEST = 1 / 12
+"""Of the tube's radius: its points lie no closer."""
+
 STRIDE_PX = 8
 """Of the pixels that tell whether a camera is within the wall."""
 
@@ -106,7 +109,8 @@ def _unlooked(
     """Points float32 [N, 3] of the ``tube``, off the surface, that lie in no picture, and that the surface
     would not hide from all cameras; and normals."""
     ends_mm = np.concatenate([own.surface.vertices_mm, T_local_camera[:, :3, 3]])
-    points_mm, normals = tube.points(ends_mm, REACH * tube.radius_mm, edge_mm)
+    spacing_mm = max(edge_mm, FINEST * tube.radius_mm)
+    points_mm, normals = tube.points(ends_mm, REACH * tube.radius_mm, spacing_mm)
     gap_mm, _ = cKDTree(own.surface.vertices_mm).query(points_mm, workers=-1)
     off, open_ = gap_mm > CLEAR * edge_mm, np.zeros(len(points_mm), bool)
     for pose in T_local_camera:
