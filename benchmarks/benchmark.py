@@ -129,8 +129,8 @@ def benchmark(
         "γ": percent(scores["gamma"], true["gamma"]),
         "n": percent(scores["light"]["n"], true["n"]),
         "q": percent(scores["light"]["q"], true["q"]),
-        "albedo RMSE": f"{albedo:.4f}",
-        "roughness RMSE": f"{roughness:.4f}",
+        "albedo RMSE": "-" if np.isnan(albedo) else f"{albedo:.4f}",
+        "roughness RMSE": "-" if np.isnan(roughness) else f"{roughness:.4f}",
         "mesh": mesh_error(twin, sequence / "truth" / "colon.ply"),
     }
 
