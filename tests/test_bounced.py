@@ -40,8 +40,12 @@ def test_base_color_and_gloss_both_send_light_back(sphere):
     light, places, albedo = sphere
     bounced = light.at(places, n=0.0, q=2.0, albedo=albedo.scaled(0.0))
     np.testing.assert_allclose(bounced, series(BASE_COLOR + GLOSSY) / RADIUS_MM**2, rtol=0.05)
+    assert bounced.mean() == pytest.approx(series(BASE_COLOR + GLOSSY) / RADIUS_MM**2, rel=0.01)
     brighter = light.at(places, n=0.0, q=2.0, albedo=albedo.scaled(0.3))
     np.testing.assert_allclose(brighter, series(BASE_COLOR * np.exp(0.3) + GLOSSY) / RADIUS_MM**2, rtol=0.05)
+    assert brighter.mean() == pytest.approx(
+        series(BASE_COLOR * np.exp(0.3) + GLOSSY) / RADIUS_MM**2, rel=0.01
+    )
 
 
 def test_one_view_is_as_one_of_several(sphere):

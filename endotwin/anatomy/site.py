@@ -9,7 +9,7 @@ import numpy as np
 from endotwin.anatomy.shape import Shape
 from endotwin.surface import Surface
 from endotwin.surface.casting import Caster
-from endotwin.surface.vectors import dot, unit
+from endotwin.surface.vectors import dot, frame_along, unit
 
 RINGS, AROUND = 7, 16
 """Of points at which the wall is probed."""
@@ -58,7 +58,7 @@ class Site:
         band_mm = max(BAND * radius_mm, BAND_MM)
         axis = unit(normal.astype(np.float64))
         for _ in range(3):
-            axes = _axes(axis)
+            axes = frame_along(axis)
             starts = point_mm + across @ axes[:2] + (radius_mm / 2 + band_mm) * axes[2]
             triangle, barycentric, distance_mm = _cast(caster, starts, -axes[2])
             normals = _normals(caster, triangle, barycentric)
@@ -165,12 +165,6 @@ class Site:
 def _powers(across: np.ndarray) -> np.ndarray:
     a, b = across.T
     return np.stack([np.ones_like(a), a, b, a * a, a * b, b * b], axis=1)
-
-
-def _axes(axis: np.ndarray) -> np.ndarray:
-    """Rows [3, 3] of a right-handed frame with the third along ``axis``."""
-    side = unit(np.cross(axis, np.eye(3)[np.abs(axis).argmin()]))
-    return np.stack([side, np.cross(axis, side), axis])
 
 
 def _cast(caster: Caster, starts: np.ndarray, direction: np.ndarray) -> tuple[np.ndarray, ...]:

@@ -142,8 +142,8 @@ class LightStage:
             if late and number:
                 break
             shared = self._coated() if self._judges(number, COAT_STEP) else self._state.shared
-            within, material, noise = self._within()
-            found = within.renewed(material, shared, self._undetermined, noise, self._relighting.varied)
+            within, material = self._within()
+            found = within.renewed(material, shared, self._undetermined, self._noise, self._relighting.varied)
             self._relighting.vary(self._solver, found)
             self._take(found)
             if late:
@@ -159,8 +159,9 @@ class LightStage:
             shared = self._coated() if self._judges(number, BOUNCE_COAT_STEP) else self._state.shared
             scale = ("albedo scale",) * (number < HOLD_STEPS)
             self._solver.held = (*self._undetermined, *BOUNCE_HELD, *scale)
-            within, material, noise = self._within()
-            self._take(within.shone(material, shared, noise) if shared.coat else Renewed(shared))
+            if shared.coat:
+                within, material = self._within()
+                self._take(within.shone(material, shared, self._noise))
             self._state, gain = self._stepped(self._state, joint=True)
             if too_dark(self._state):
                 self._state = self._relighting.without_bounce(self._solver, self._state)
@@ -181,7 +182,7 @@ class LightStage:
         for _ in range(STEPS):
             if self._pace.light_is_over():
                 break
-            within, material, _ = self._within()
+            within, material = self._within()
             found = within.renewed(material, self._state.shared, held, best.noise, varied)
             self._relighting.brighten(self._solver, found.log_gain)
             self._take(found)
@@ -197,11 +198,16 @@ class LightStage:
     def _late(self) -> bool:
         return self._pace.left(LIGHT) <= 2 * self._cost.step_s
 
-    def _within(self) -> tuple[Within, torch.Tensor, float]:
-        """The pixels by vertex, their materials, and the noise that is left."""
+    @property
+    def _noise(self) -> float:
+        """That is left of the photos."""
+        return self._solver.noise(self._state)
+
+    def _within(self) -> tuple[Within, torch.Tensor]:
+        """The pixels by vertex, and their materials."""
         samples, triangles = self._solver.samples, self._solver.triangles
         material = at_pixels(samples, triangles, self._state.materials)
-        return Within.of(samples, self._surface, self._unit_mm), material, self._solver.noise(self._state)
+        return Within.of(samples, self._surface, self._unit_mm), material
 
     def _take(self, found: Renewed) -> None:
         mean = self._state.mean + torch.tensor([0.0, 0.0, 0.0, found.roughness])
@@ -215,7 +221,7 @@ class LightStage:
         """The number of the step that follows: where this one changed the cost by hardly anything (``gain``),
         that of the coat, or none."""
         self._pace.report("find the light", number + 1, steps)
-        if abs(gain) >= CONVERGED * self._solver.cost(self._state, self._solver.noise(self._state)):
+        if abs(gain) >= CONVERGED * self._solver.cost(self._state, self._noise):
             return number + 1
         return max(number + 1, coat_step) if self._judged is None else steps
 
@@ -229,7 +235,7 @@ class LightStage:
         shiny = Samples.joined([solver.samples, under], solver.samples.views)
         material = at_pixels(shiny, solver.triangles, state.materials)
         seen = Within.of(shiny, self._surface, self._unit_mm)
-        highlights = seen.highlights(material, state.shared, solver.noise(state))
+        highlights = seen.highlights(material, state.shared, self._noise)
         layer, self._judged = judged_coat(highlights, self._coat)
         return replace(state.shared, coat=layer)
 

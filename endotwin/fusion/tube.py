@@ -7,10 +7,12 @@ extrapolation of the surface itself would.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
 from endotwin.surface import Surface
+from endotwin.surface.vectors import frame_along
 
 VERTICES = 20_000
 """That are fitted; more say no more of six numbers."""
@@ -27,9 +29,14 @@ class Tube:
     centre_mm: np.ndarray
     radius_mm: float
 
+    @cached_property
+    def _across(self) -> np.ndarray:
+        """Two unit vectors across the axis and each other, columns of [3, 2]."""
+        return frame_along(self.axis)[:2].T
+
     def holds(self, points_mm: np.ndarray) -> bool:
         """Whether more than half of the points [N, 3] lie within."""
-        across_mm = (points_mm - self.centre_mm) @ _across(self.axis)
+        across_mm = (points_mm - self.centre_mm) @ self._across
         return float(np.median(np.linalg.norm(across_mm, axis=1))) < self.radius_mm
 
     def points(
@@ -43,12 +50,12 @@ class Tube:
         middle_mm = np.arange(low_mm, high_mm, spacing_mm)
         slope = np.concatenate([-np.cos(angle), np.zeros(len(middle_mm)), np.cos(angle)])
         start_mm = np.concatenate([np.full(len(angle), low_mm), middle_mm, np.full(len(angle), high_mm)])
-        across, found = _across(self.axis), []
+        found = []
         for at_mm, sine in zip(start_mm, slope, strict=True):
             cosine = np.sqrt(1 - sine * sine)
             count = max(3, round(2 * np.pi * self.radius_mm * cosine / spacing_mm))
             turn = 2 * np.pi * np.arange(count) / count
-            outward = cosine * np.stack([np.cos(turn), np.sin(turn)], axis=1) @ across.T
+            outward = cosine * np.stack([np.cos(turn), np.sin(turn)], axis=1) @ self._across.T
             outward = outward + sine * self.axis
             found.append((self.centre_mm + at_mm * self.axis + self.radius_mm * outward, -outward))
         points_mm, normals = (np.concatenate(each).astype(np.float32) for each in zip(*found, strict=True))
@@ -70,7 +77,7 @@ def tube_of(surface: Surface) -> Tube | None:
     for _ in range(ROUNDS):
         axis = np.linalg.eigh((normals * weight[:, None]).T @ normals)[1][:, 0]
         weight = _trust(normals @ axis)
-    across = _across(axis)
+    across = frame_along(axis)[:2].T
     flat_mm, towards = vertices_mm @ across, normals @ across
     columns = np.stack([np.ones_like(towards), np.zeros_like(towards), -towards], axis=2)
     columns[:, 1, :2] = 0, 1
@@ -89,10 +96,3 @@ def tube_of(surface: Surface) -> Tube | None:
 def _trust(error: np.ndarray) -> np.ndarray:
     """Weights [N] of Cauchy's loss, as wide as the median size of the errors [N]."""
     return 1 / (1 + (error / max(float(np.median(np.abs(error))), 1e-9)) ** 2)
-
-
-def _across(axis: np.ndarray) -> np.ndarray:
-    """Two unit vectors across the axis and each other, columns of [3, 2]."""
-    first = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
-    first /= np.linalg.norm(first)
-    return np.stack([first, np.cross(axis, first)], axis=1)

@@ -35,6 +35,12 @@ def unit(vectors: np.ndarray) -> np.ndarray:
     return _by_columns(np.divide, vectors, (norm,) * 3)
 
 
+def frame_along(axis: np.ndarray) -> np.ndarray:
+    """Rows [3, 3] of a right-handed frame with the third along the unit vector ``axis`` [3]."""
+    side = unit(np.cross(axis, np.eye(3)[np.abs(axis).argmin()]))
+    return np.stack([side, np.cross(axis, side), axis])
+
+
 def turned_along(vectors: np.ndarray, one: np.ndarray, other: np.ndarray) -> np.ndarray:
     """Vectors [N, 3] turned as unit vectors ``one`` [N, 3] turn the least way to ``other`` [N, 3], which they
     are not opposite to (Rodrigues)."""

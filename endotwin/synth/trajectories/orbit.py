@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from endotwin.errors import TrajectoryError
-from endotwin.surface.vectors import unit
+from endotwin.surface.vectors import frame_along
 from endotwin.synth.trajectories.flight import posed, untwisted
 from endotwin.synth.trajectories.wall_point import WallPoint, wall_point
 from endotwin.twin import Twin
@@ -34,10 +34,10 @@ def orbit(options: OrbitOptions, twin: Twin) -> tuple[np.ndarray, str]:
     surface = twin.surface
     nearest = cKDTree(surface.vertices_mm).query(point - surface.origin_mm)[1]
     normal = surface.normals[nearest].astype(np.float64)
-    side = unit(np.cross(normal, np.eye(3)[np.abs(normal).argmin()]))
+    side, beside, _ = frame_along(normal)
     angle = np.arange(options.frames) * 2 * np.pi / max(options.frames, 1)
     tilt = np.deg2rad(options.tilt)
-    around = np.cos(angle)[:, None] * side + np.sin(angle)[:, None] * np.cross(normal, side)
+    around = np.cos(angle)[:, None] * side + np.sin(angle)[:, None] * beside
     away = np.cos(tilt) * normal + np.sin(tilt) * around
     places = point + options.radius * away
     where = ", ".join(f"{value:.2f}" for value in point)
