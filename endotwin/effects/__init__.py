@@ -19,7 +19,7 @@ FITTED = (
 )
 RENDERED = (
     *("auto_gain", "noise", "motion_blur", "defocus", "rolling_shutter", "interlacing", "chromatic"),
-    *("bloom", "lens", "processor", "overlay", "codec", "video"),
+    *("bloom", "lens", "processor", "overlay", "chroma", "codec", "video"),
 )
 NAMES = (*FITTED, *RENDERED)
 

@@ -8,7 +8,7 @@ on its way in this order:
 - when pixels see it (motion blur, rolling shutter, interlacing);
 - what the lens makes of the radiance image (vignetting, defocus, chromatic, bloom, lens);
 - what the sensor makes of that (gain, auto_gain, noise);
-- what becomes of the picture afterwards (processor, overlay, codec, video).
+- what becomes of the picture afterwards (processor, overlay, chroma, codec, video).
 """
 
 from __future__ import annotations

@@ -6,7 +6,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
-import cv2
 import numpy as np
 from scipy.special import stdtrit
 from torch import Tensor
@@ -74,8 +73,7 @@ class Interlacing(Effect):
         share, by Student's t of the frames' scatter, or of a coin's if that is more. A still camera has none.
         """
         chosen = spread(len(sequence), FRAMES)
-        lit = np.pad(sequence.lens_mask.astype(np.uint8), 1)
-        lit = cv2.erode(lit, np.ones((2 * MARGIN_PX + 1,) * 2))[1:-1, 1:-1] > 0
+        lit = sequence.well_lit(MARGIN_PX)
         across, along = zip(*(_details(sequence.color(index), lit) for index in chosen), strict=True)
         (rows, rows_error, tiles), (columns, columns_error, _) = _share(across), _share(along)
         told = f"{rows:.0%} of the finest detail alternates by rows, {columns:.0%} by columns"

@@ -162,6 +162,11 @@ class Sequence:
             lit = cv2.resize(lit, (self.camera.width, self.camera.height), interpolation=self._interpolation)
         return (lit > 0.999) & np.isfinite(self.camera.pixel_directions).all(axis=2)
 
+    def well_lit(self, margin_px: int) -> np.ndarray:
+        """Bool [H, W]: pixels within the ``lens_mask``, farther than ``margin_px`` from its edge."""
+        lit = np.pad(self.lens_mask.astype(np.uint8), 1)
+        return cv2.erode(lit, np.ones((2 * margin_px + 1,) * 2))[1:-1, 1:-1] > 0
+
     @property
     def _interpolation(self) -> int:
         return cv2.INTER_AREA if self.scale < 1 else cv2.INTER_LINEAR

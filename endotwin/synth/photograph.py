@@ -17,7 +17,7 @@ EXPOSURE = ("motion_blur", "rolling_shutter")
 OPTICS = ("defocus", "chromatic", "bloom", "lens")
 """In the order in which light meets them."""
 
-RECORDING = ("processor", "overlay", "codec", "video")
+RECORDING = ("processor", "overlay", "chroma", "codec", "video")
 """In the order in which the picture meets them."""
 
 

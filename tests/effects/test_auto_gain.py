@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -10,8 +11,12 @@ import tube_twin
 
 import endotwin
 import endotwin.synth
-from endotwin.effects import Effects
+from endotwin.effects import Effect, Effects
 from endotwin.effects.auto_gain import AutoGain
+from endotwin.effects.exposures import Exposures
+from endotwin.effects.noise import Noise
+from endotwin.sequence import Sequence
+from endotwin.sequence.readers import open_sequence
 from endotwin.synth.trajectories.trajectory import Trajectory
 
 GAMMA = 1 / 2.2
@@ -65,6 +70,40 @@ def test_pictures_reach_the_target_and_a_change_is_followed_late(twin, tmp_path)
     assert abs(change) > 0.02
     left = np.log(gains[-1] / lagging[21:]) / change
     assert (np.diff(left) < 0).all() and 0.5 < left[0] < 1 and left[-1] < 0.1
+
+
+def recording(twin: endotwin.Twin, folder: Path, *effects: Effect) -> Sequence:
+    """A camera that nears the wall and leaves it, for four seconds, as a sequence of files."""
+    times_s = np.arange(120) / 30
+    poses = np.stack([tube_twin.pose(0.4 + 0.05 * t) for t in times_s])
+    poses[:, 1, 3] += 8 * np.sin(2 * times_s)
+    equipped = replace(twin, effects=Effects(effects))
+    endotwin.synth.synthesize(
+        equipped, Trajectory(poses, times_s, "side to side"), folder, labels=("rgb", "depth")
+    )
+    return open_sequence(folder)
+
+
+@pytest.mark.parametrize("lag", [0.0, 0.1, 0.5])
+def test_target_and_lag_put_in_come_out(twin, tmp_path, lag):
+    found, _ = AutoGain.evidence(recording(twin, tmp_path / "held", AutoGain(0.35, lag, 100.0), Noise()))
+    assert found.target == pytest.approx(0.35, abs=0.035)  # metering ten times a second waits, too
+    assert found.lag == pytest.approx(lag, rel=0.25, abs=0.035)  # metering ten times a second waits, too
+
+
+def test_a_camera_that_keeps_its_gain_tells_none(twin, tmp_path):
+    sequence = recording(twin, tmp_path / "kept", Noise())
+    assert AutoGain.evidence(sequence)[0] is None
+    assert np.abs(Exposures.of(sequence, range(120)).log_change).max() < 0.01
+
+
+@pytest.mark.parametrize(
+    "kind, told",
+    [("direct", False), ("gi", False), ("offset", False), ("bounce", False), ("scope", True), ("wet", True)],
+)
+def test_path_traced_colons_tell_an_automatic_gain_where_they_have_one(data_root, kind, told):
+    folder = data_root / f"colon_{kind}"
+    assert (AutoGain.evidence(open_sequence(folder))[0] is not None) == told
 
 
 @pytest.mark.slow
