@@ -13,24 +13,30 @@ import tube_sequence
 import tube_twin
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
+import endotwin
 from endotwin.cameras import Pinhole
 from endotwin.config import STANDARD
-from endotwin.effects import Effects
+from endotwin.effects import Effect, Effects
+from endotwin.effects.bloom import Bloom
+from endotwin.effects.coat import Coat
 from endotwin.effects.film import Film as FilmEffect
 from endotwin.effects.offset import Offset
 from endotwin.effects.specular import Specular
 from endotwin.errors import TwinError
-from endotwin.fit.film import Model, _Glints, _Lobes
+from endotwin.fit.bloom import RADII, bloom
+from endotwin.fit.film import LEAST_DB, Found, Model, _Glints, _Lobes
 from endotwin.fit.lighting import Relighting
 from endotwin.light.film import Film, mirrored, mirrors
 from endotwin.light.shading import F0_WATER
 from endotwin.pixels.pace import Pace
-from endotwin.pixels.samples import gather
+from endotwin.pixels.samples import Samples, gather
 from endotwin.render import Renderer
 from endotwin.surface.casting import Caster
 from endotwin.surface.vectors import unit
 from endotwin.synth.job import fingerprint
+from endotwin.synth.photograph import photographed
 from endotwin.twin import Twin
 
 GUIDES = Offset(((3.2, 0.5, 0.0), (-2.8, 2.7, 0.0)))
@@ -66,7 +72,8 @@ def recorded(folder: Path, twin: Twin, poses: np.ndarray = POSES) -> Twin:
     renderer = Renderer(twin)
     for index, pose in enumerate(poses):
         view = renderer.view(pose)
-        cv2.imwrite(str(folder / f"{index:04d}_color.png"), np.uint8(view.color * 255 + 0.5)[..., ::-1])
+        color, _ = photographed(renderer, view, pose, pose, np.random.default_rng(0))
+        cv2.imwrite(str(folder / f"{index:04d}_color.png"), np.uint8(color * 255 + 0.5)[..., ::-1])
         tifffile.imwrite(
             folder / f"{index:04d}_depth.tiff", np.uint16(np.nan_to_num(view.depth_mm) / 100 * 65535)
         )
@@ -85,12 +92,19 @@ def tube(effects: Effects) -> Twin:
     )
 
 
+def known(twin: Twin) -> tuple[Model, Samples]:
+    """The model of all but film and bloom, and training pixels."""
+    caster, state = Caster(twin.surface), tube_twin.state_of(twin)
+    state = replace(state, shared=replace(state.shared, coat=twin.effects.get("coat")))
+    samples = gather(twin, Pace(STANDARD.fit), 0, caster)
+    relighting = Relighting(twin.surface, caster, twin.effects.without(["film", "bloom"]), samples.views)
+    return Model(twin, state, relighting, caster), samples
+
+
 def found(twin: Twin, wanted: str = "auto"):
     """What the fit says of the film, when it knows all else."""
-    caster, state = Caster(twin.surface), tube_twin.state_of(twin)
-    samples = gather(twin, Pace(STANDARD.fit), 0, caster)
-    relighting = Relighting(twin.surface, caster, twin.effects.without(["film"]), samples.views)
-    return Model(twin, state, relighting, caster).film(samples, wanted, lambda *_: None)
+    model, samples = known(twin)
+    return model.film(samples, wanted, lambda *_: None)
 
 
 @pytest.fixture(scope="module", params=["lens", "guides"])
@@ -145,6 +159,36 @@ def test_a_dry_tube_has_no_film_unless_it_is_forced_on(tmp_path):
     dry = found(twin)
     assert dry.film is None and dry.effect is None and dry.decision.state == "off"
     assert found(twin, "off").decision.reason == "forced off"
+
+
+def lacquered(folder: Path, *effects: Effect) -> Twin:
+    """A recording of the wall, face to face, that mirrors the light at the lens."""
+    aside = np.eye(4)
+    aside[:3, :3] = Rotation.from_euler("y", 80, degrees=True).as_matrix()
+    coat = Coat(weight=1.0, roughness=0.15)
+    return recorded(folder / "sequence", tube(Effects([Specular(), coat, *effects])), POSES @ aside)
+
+
+@pytest.mark.parametrize("share, radius", [(0.3, RADII[2]), (0.15, RADII[3])])
+def test_bloom_about_highlights_is_found_with_its_share_and_radius(tmp_path, share, radius):
+    model, samples = known(lacquered(tmp_path, Bloom(share, radius)))
+    effect, decision = bloom(model, Found(decision=None), samples, "auto", lambda *_: None)
+    assert decision.state == "on" and decision.gain_db > LEAST_DB
+    assert effect.radius == radius and effect.share == pytest.approx(share, rel=0.15)
+    assert bloom(model, Found(decision=None), samples, "off", lambda *_: None)[0] is None
+
+
+def test_scores_are_of_pictures_with_their_bloom(tmp_path):
+    twin = lacquered(tmp_path, Bloom(0.3, 0.02))
+    without = replace(twin, effects=twin.effects.without(["bloom"]))
+    assert endotwin.evaluate(twin).psnr > 45 > 41 > endotwin.evaluate(without).psnr
+
+
+def test_highlights_without_bloom_tell_none(tmp_path):
+    model, samples = known(lacquered(tmp_path))
+    assert (samples.color == 255).any()
+    effect, decision = bloom(model, Found(decision=None), samples, "auto", lambda *_: None)
+    assert effect is None and decision.gain_db < LEAST_DB / 2
 
 
 def test_a_film_of_weight_1_mirrors_the_light_as_the_lobe_at_the_mirror_direction_does():

@@ -50,7 +50,8 @@ class Bloom(Effect):
 
     @classmethod
     def evidence(cls, sequence: Sequence) -> tuple[Bloom | None, str]:
-        """Never by itself: how far a clipped highlight exceeds the range is not in the photo."""
+        """Never by photos alone: how far a clipped highlight exceeds the range is not in them. A fit, which
+        knows by the others of its photos how bright it was, tells."""
         return None, "rendered on request: a clipped highlight does not tell how bright it was"
 
 

@@ -26,6 +26,7 @@ from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 
 import numpy as np
+import torch
 
 from endotwin.align.photos import photo_of, well_inside
 from endotwin.align.scene import Scene
@@ -264,7 +265,12 @@ def _shown_by_twin(twin: Twin, sequence: Sequence) -> Show:
         if "gain" in twin.effects:
             gain = gain_of(photo[valid], view.radiance[valid], twin.response.gamma)
             view = renderer.view(frame.T_world_camera, sequence.lens_mask, gain)
-        return view.color, gain, valid & covered_pixels(view.hits, twin.surface, valid.shape)
+        color = view.color
+        if "bloom" in twin.effects:
+            radiance = torch.from_numpy(view.radiance)
+            glared = twin.effects["bloom"].through(radiance, view.depth_mm, sequence.camera)
+            color = shading.respond(glared, twin.response.gamma).clamp(0, 1).numpy()
+        return color, gain, valid & covered_pixels(view.hits, twin.surface, valid.shape)
 
     return show
 

@@ -27,7 +27,7 @@ from endotwin.fit.gauss_newton import State
 from endotwin.fit.lighting import Relighting, lit
 from endotwin.fit.model import at_pixels, radiance
 from endotwin.light import shading
-from endotwin.light.film import Film, mirrored, mirrors_in_view
+from endotwin.light.film import Film, film_in_view, mirrored, mirrors_in_view
 from endotwin.light.guides import lamps_mm
 from endotwin.pixels.samples import Samples, Views, frame_samples
 from endotwin.run.ahead import ahead
@@ -128,6 +128,27 @@ class Model:
         effect = FilmEffect(roughness=roughness)
         return Found(decided("on", reason, gain_db), film, effect, trials[best].film(ours))
 
+    @property
+    def guides_mm(self) -> np.ndarray:
+        """Places of the light guides in the camera frame, [K, 3]."""
+        return lamps_mm(self.relighting.effects.guides_mm)
+
+    def photo(self, views: Views, row: int) -> Based:
+        """All pixels of the photo of ``row`` among the ``views``, with what the model shows there."""
+        twin, effects = self.twin, self.relighting.effects
+        frame = twin.sequence().frame(int(views.frames[row]))
+        part = frame_samples(twin, self.caster, frame, views.lens_mask, 1.0, np.random.default_rng(0))
+        return self.based(lit(Samples.joined([part], views), twin.surface, self.caster, effects))
+
+    def shining(self, samples: Samples, row: int, film: Film, roughness: float) -> Tensor:
+        """Radiance [N, 1] of a ``film`` at samples of the photo of ``row`` among their views."""
+        effects, surface = self.relighting.effects, self.twin.surface
+        caster = self.caster if "shadows" in effects else None
+        more = self.guides_mm, effects.profile, self.state.shared.log_light, caster
+        glow = film_in_view(film, roughness, surface.vertices_mm, samples.views.T_local_camera[row], *more)
+        corners = torch.from_numpy(glow[surface.triangles[samples.triangle.numpy()]])
+        return (samples.barycentric * corners).sum(dim=1, keepdim=True) * exposure_of(samples)
+
     def based(self, samples: Samples) -> Based:
         """``samples``, which the guides light, with what the model shows there."""
         triangles = torch.from_numpy(self.twin.surface.triangles.astype(np.int64))
@@ -197,7 +218,7 @@ class Based:
     def most_db(self) -> float:
         """What explaining every glint would gain."""
         squared = ((self.shown - self.predicted()) ** 2).sum(dim=1).double()
-        return _decibels(float(squared.sum()), float(squared[~self.shines].sum()))
+        return decibels(float(squared.sum()), float(squared[~self.shines].sum()))
 
     def gains_db(self, vertex: np.ndarray, trials: Iterable[_Lobes]) -> list[float]:
         """What each of the ``trials``, lobes of ``vertex``, gains in the photos that are kept apart."""
@@ -206,16 +227,20 @@ class Based:
         mix, row, place = _pairs(apart, vertex)
         half, strength = mirrors_of(self.model, self.samples.views, vertex, row, place)
         glints = _Glints(vertex, None, torch.from_numpy(place), half, strength, None, None, None, 0.0)
-        exposure = 1.0 if apart.samples.log_exposure is None else apart.samples.log_exposure.exp()[:, None]
         films = (torch.from_numpy(mix @ lobes.radiance(glints).numpy())[:, None] for lobes in trials)
         before, *after = (
             float(((apart.shown - apart.predicted(film)) ** 2).sum())
-            for film in (0.0, *(film * exposure for film in films))
+            for film in (0.0, *(film * exposure_of(apart.samples) for film in films))
         )
-        return [_decibels(before, each) for each in after]
+        return [decibels(before, each) for each in after]
 
 
-def _decibels(before: float, after: float) -> float:
+def exposure_of(samples: Samples) -> Tensor:
+    """Gain and vignetting, [N, 1], or [1, 1] of 1."""
+    return torch.ones(1, 1) if samples.log_exposure is None else samples.log_exposure.exp()[:, None]
+
+
+def decibels(before: float, after: float) -> float:
     return 10 * math.log10(max(before, 1e-12) / max(after, 1e-12))
 
 
@@ -247,14 +272,14 @@ class _Glints:
         half, strength = mirrors_of(model, samples.views, vertex, row, place)
         near = mix.power(NEARNESS)
         near = (near / near.sum(axis=0)).T.tocsr()
-        exposure = torch.ones(len(samples)) if samples.log_exposure is None else samples.log_exposure.exp()
-        means = [torch.from_numpy(near @ each.numpy()) for each in (exposure, based.shown, based.radiance)]
+        shown = exposure_of(samples).expand(len(samples), 1), based.shown, based.radiance
+        means = [torch.from_numpy(near @ each.numpy()) for each in shown]
         return cls(
             vertex,
             torch.from_numpy(row),
             torch.from_numpy(place),
             half,
-            strength * means[0][:, None],
+            strength * means[0],
             *means[1:],
             torch.from_numpy(model.twin.surface.normals[vertex]),
             model.state.shared.gamma,
@@ -366,8 +391,8 @@ def mirrors_of(
     """Half vectors [P, K, 3] in the surface's frame and strengths [P, K] of the guides, 0 in their shadow, at
     the vertices ``vertex[place]`` in the views ``row`` (ascending), both [P]."""
     effects, surface = model.relighting.effects, model.twin.surface
-    guides_mm = lamps_mm(effects.guides_mm)
     caster = model.caster if "shadows" in effects else None
+    guides_mm = model.guides_mm
     halves, strengths = [torch.zeros(0, len(guides_mm), 3)], [torch.zeros(0, len(guides_mm))]
     for view in np.unique(row):
         points_mm = surface.vertices_mm[vertex[place[row == view]]]

@@ -15,10 +15,11 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from endotwin.effects import Decision, Effects
+from endotwin.effects import Decision, Effect, Effects
 from endotwin.errors import SequenceError
 from endotwin.evidence.decide import decide
 from endotwin.evidence.glints import Glints
+from endotwin.fit.bloom import bloom
 from endotwin.fit.film import Found, Model
 from endotwin.fit.gauss_newton import CPU, GaussNewton, State, unusual
 from endotwin.fit.hashgrid import HashGrid, HashOperator
@@ -124,16 +125,7 @@ def fit_twin(
         samples = relighting.guided(samples)
         state, normals, left = _find_detail(samples, twin, state, cost, pace, relighting, device)
         twin = replace(twin, surface=replace(surface, normals=normals))
-    with stopwatch.stage("film"):
-        wanted = states.get("film", "auto") if "specular" in decided.effects else "off"
-        wet, model = Found(Decision("off", "no time to judge")), Model(twin, state, relighting, caster)
-        if not pace.out_of_time():
-            wet = model.film(samples, wanted, pace.report)
-    with stopwatch.stage("sparkle"):
-        wanted = states.get("sparkle", "auto") if "specular" in decided.effects else "off"
-        glitter, counted = None, Decision("off", "no time to judge")
-        if not pace.out_of_time():
-            glitter, counted = sparkle(model, wet, samples.views, wanted, pace.report)
+    film, beyond, why = _beyond(Model(twin, state, relighting, caster), samples, states, pace)
     odd = unusual(state.shared)
     if odd:
         logger.warning(
@@ -142,18 +134,42 @@ def fit_twin(
             *(" and ".join(odd), twin.source.path),
         )
     with stopwatch.stage("price"):
-        decisions = {**decided.decisions, "coat": coat, "film": wet.decision, "sparkle": counted}
+        decisions = {**decided.decisions, "coat": coat, **why}
         if "interreflection" in decided.effects and not relighting.bounces:
             decisions["interreflection"] = _without_bounce(decisions["interreflection"])
         if left is not None and (said := residual_warning(left, twin.sequence(), decisions)):
             logger.warning("%s; 'endotwin check %s' looks for the cause", said, twin.source.path)
         effects = relighting.effects
-        for effect in filter(None, (wet.effect, glitter)):
+        for effect in beyond:
             effects = effects.including(effect)
-        fitted = price(_fitted(twin, state, effects, decisions, wet.film), caster, samples.views)
+        fitted = price(_fitted(twin, state, effects, decisions, film), caster, samples.views)
     return fitted.with_record(
         fit={"method": "twin", "undetermined": list(start.undetermined), **stopwatch.to_dict()}
     )
+
+
+def _beyond(
+    model: Model, samples: Samples, states: Mapping[str, str], pace: Pace
+) -> tuple[Film | None, list[Effect], dict[str, Decision]]:
+    """What highlights show beyond the model, as far as there is time: the film, effects that are on, and why
+    each is on or off."""
+    hurried = Decision("off", "no time to judge")
+    wet, glitter, glare, stage = Found(hurried), (None, hurried), (None, hurried), pace.stopwatch.stage
+    specular = "specular" in model.relighting.effects
+    film, sparkles, glares = (
+        states.get(name, "auto") if specular else "off" for name in ("film", "sparkle", "bloom")
+    )
+    with stage("film"):
+        if not pace.out_of_time():
+            wet = model.film(samples, film, pace.report)
+    with stage("sparkle"):
+        if not pace.out_of_time():
+            glitter = sparkle(model, wet, samples.views, sparkles, pace.report)
+    with stage("bloom"):
+        if not pace.out_of_time():
+            glare = bloom(model, wet, samples, glares, pace.report)
+    found = [each for each in (wet.effect, glitter[0], glare[0]) if each is not None]
+    return wet.film, found, {"film": wet.decision, "sparkle": glitter[1], "bloom": glare[1]}
 
 
 def _without_bounce(decision: Decision) -> Decision:

@@ -24,13 +24,11 @@ from scipy.special import exp1, xlogy
 from endotwin.cameras.base import solid_angle
 from endotwin.effects import Decision
 from endotwin.effects.sparkle import Sparkle
-from endotwin.fit.film import APART, GLINT, REACH_PX, Model, Report
+from endotwin.fit.film import APART, GLINT, REACH_PX, Model, Report, exposure_of
 from endotwin.fit.film import Found as FoundFilm
-from endotwin.fit.lighting import lit
 from endotwin.light import shading
-from endotwin.light.film import Film, film_in_view, mirrors, mirrors_in_view
-from endotwin.light.guides import lamps_mm
-from endotwin.pixels.samples import CLIPPED, Samples, Views, frame_samples
+from endotwin.light.film import Film, mirrors, mirrors_in_view
+from endotwin.pixels.samples import CLIPPED, Samples, Views
 from endotwin.run.ahead import ahead
 from endotwin.run.threads import THREADS
 from endotwin.sequence.spread import spread
@@ -112,20 +110,10 @@ class _Photo:
     @classmethod
     def of(cls, model: Model, views: Views, row: int, wet: FoundFilm | None) -> _Photo:
         """That of ``row`` among the ``views``."""
-        twin, gamma, effects = model.twin, model.state.shared.gamma, model.relighting.effects
-        frame = twin.sequence().frame(int(views.frames[row]))
-        part = frame_samples(twin, model.caster, frame, views.lens_mask, 1.0, np.random.default_rng(0))
-        based = model.based(lit(Samples.joined([part], views), twin.surface, model.caster, effects))
+        based, gamma = model.photo(views, row), model.state.shared.gamma
         samples, beyond = based.samples, based.radiance
         if wet is not None and wet.apart is not None:
-            caster = model.caster if "shadows" in effects else None
-            more = _guides(model), effects.profile, model.state.shared.log_light, caster
-            glow = film_in_view(
-                wet.apart, wet.effect.roughness, twin.surface.vertices_mm, views.T_local_camera[row], *more
-            )
-            corners = glow[twin.surface.triangles[samples.triangle.numpy()]]
-            shine = (samples.barycentric.numpy() * corners).sum(axis=1) * _exposure(samples)
-            beyond = beyond + torch.from_numpy(shine)[:, None]
+            beyond = beyond + model.shining(samples, row, wet.apart, wet.effect.roughness)
         shown = shading.respond(beyond, gamma).numpy()
         least = shading.radiance_of(shown + GLINT, gamma) - beyond.numpy()
         excess = shading.radiance_of(based.shown.numpy(), gamma) - beyond.numpy()
@@ -165,14 +153,6 @@ class _Photo:
         return found
 
 
-def _guides(model: Model) -> np.ndarray:
-    return lamps_mm(model.relighting.effects.guides_mm)
-
-
-def _exposure(samples: Samples) -> np.ndarray | float:
-    return 1.0 if samples.log_exposure is None else samples.log_exposure.exp().numpy()
-
-
 @dataclass(frozen=True, eq=False)
 class _Places(Rows):
     """How pixels stand to K guides.
@@ -196,13 +176,13 @@ class _Places(Rows):
         """Of the samples ``index`` [N] of a photo."""
         samples, shared = photo.samples[torch.from_numpy(index)], model.state.shared
         points_mm, normals = samples.points_mm, samples.normals(model.twin.surface)
-        guides_mm, profile = _guides(model), model.relighting.effects.profile
+        guides_mm, profile = model.guides_mm, model.relighting.effects.profile
         half, strength = mirrors(points_mm, guides_mm, profile, shared.log_light)
         cos_m = np.einsum("na,nka->nk", normals, half).clip(1e-3, 1)
         cos_o = dot(normals, unit(-points_mm)).clip(1e-3, 1)
         cos_i = samples.cos[:, None] if samples.guides is None else samples.guides.cos_i
         seen_mm2 = dot(points_mm, points_mm) * solid_angle(samples.views.camera, _uv(samples))
-        gain = strength.numpy() * cos_i.numpy() * (cos_o * _exposure(samples) / seen_mm2)[:, None]
+        gain = strength.numpy() * cos_i.numpy() * (cos_o / seen_mm2)[:, None] * exposure_of(samples).numpy()
         gain = shading.F0_WATER * gain / cos_m**4
         corners = model.twin.surface.triangles[samples.triangle.numpy()]
         wet = np.ones(len(index), bool) if film is None else film.wets(corners)
@@ -379,7 +359,7 @@ def _followed(
     effects, halves = model.relighting.effects, []
     for view in (row, other):
         pose = views.T_local_camera[view]
-        more = _guides(model), effects.profile, model.state.shared.log_light, None
+        more = model.guides_mm, effects.profile, model.state.shared.log_light, None
         halves.append(mirrors_in_view(points_mm, pose, *more)[0])
     normals = np.einsum("nab,nb->na", samples.rotation, samples.normals(surface))
     nearest = np.einsum("na,nka->nk", normals, halves[0]).argmax(axis=1)

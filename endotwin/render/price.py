@@ -28,7 +28,7 @@ LEAST_S = 0.3
 def priced(twin: Twin, caster: Caster, views: Views) -> Twin:
     """``twin`` with the price of each effect that is on in its decisions, by the middle one of ``views``, and
     those only rendered in them too."""
-    decisions = {**twin.decisions, **_rendered(views)}
+    decisions = {**_rendered(views), **twin.decisions}
     pose = twin.surface.to_world(views.T_local_camera[len(views.frames) // 2])
     dear = [name for name in twin.effects if name in decisions and name not in FREE]
     if dear:
