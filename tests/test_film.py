@@ -172,10 +172,10 @@ def lacquered(folder: Path, *effects: Effect) -> Twin:
 @pytest.mark.parametrize("share, radius", [(0.3, RADII[2]), (0.15, RADII[3])])
 def test_bloom_about_highlights_is_found_with_its_share_and_radius(tmp_path, share, radius):
     model, samples = known(lacquered(tmp_path, Bloom(share, radius)))
-    effect, decision = bloom(model, Found(decision=None), samples, "auto", lambda *_: None)
+    effect, decision = bloom(Found(None, model), samples, "auto", lambda *_: None)
     assert decision.state == "on" and decision.gain_db > LEAST_DB
     assert effect.radius == radius and effect.share == pytest.approx(share, rel=0.15)
-    assert bloom(model, Found(decision=None), samples, "off", lambda *_: None)[0] is None
+    assert bloom(Found(None, model), samples, "off", lambda *_: None)[0] is None
 
 
 def test_scores_are_of_pictures_with_their_bloom(tmp_path):
@@ -187,7 +187,7 @@ def test_scores_are_of_pictures_with_their_bloom(tmp_path):
 def test_highlights_without_bloom_tell_none(tmp_path):
     model, samples = known(lacquered(tmp_path))
     assert (samples.color == 255).any()
-    effect, decision = bloom(model, Found(decision=None), samples, "auto", lambda *_: None)
+    effect, decision = bloom(Found(None, model), samples, "auto", lambda *_: None)
     assert effect is None and decision.gain_db < LEAST_DB / 2
 
 

@@ -189,7 +189,7 @@ def measured(twin, wanted: str):
     samples = gather(twin, Pace(STANDARD.fit), 0, caster)
     effects = twin.effects.without(["sparkle"])
     model = Model(twin, state, Relighting(twin.surface, caster, effects, samples.views), caster)
-    return sparkle(model, Found(Decision("off", "")), samples.views, wanted, lambda *_: None)
+    return sparkle(Found(Decision("off", ""), model), samples.views, wanted, lambda *_: None)
 
 
 @pytest.mark.slow
@@ -213,5 +213,5 @@ def test_photos_without_sparkles_tell_of_none(tmp_path):
 
 def test_two_photos_are_too_few_to_tell():
     views = Views(CAMERA, np.ones((144, 192), bool), np.arange(2), np.stack([POSE, POSE]))
-    found, decision = sparkle(None, Found(Decision("on", "")), views, "on", lambda *_: None)
+    found, decision = sparkle(Found(Decision("on", ""), None), views, "on", lambda *_: None)
     assert found is None and decision.state == "off" and "too few photos" in decision.reason

@@ -11,7 +11,7 @@ import torch
 
 from endotwin.effects import Decision
 from endotwin.effects.bloom import SATURATION, Bloom
-from endotwin.fit.film import LEAST_DB, Found, Model, Report, decibels
+from endotwin.fit.film import LEAST_DB, Found, Report, decibels
 from endotwin.light import shading
 from endotwin.pixels.samples import CLIPPED, Samples, Views
 from endotwin.run.ahead import ahead
@@ -28,11 +28,10 @@ BESIDE_PX = 2
 """So near to what saturates its blurred edge is, and what a highlight's place errs by."""
 
 
-def bloom(
-    model: Model, wet: Found, samples: Samples, wanted: str, report: Report
-) -> tuple[Bloom | None, Decision]:
-    """The bloom that photos show about what saturates in ``model`` with its film, unless ``wanted`` is off;
-    and why. ``samples`` are the training pixels.
+def bloom(wet: Found, samples: Samples, wanted: str, report: Report) -> tuple[Bloom | None, Decision]:
+    """The bloom that photos show about what saturates in a model with its film, ``wet``; and why.
+
+    ``samples`` are the training pixels; ``wanted`` is auto or off.
 
     Its share is that of least squares in display values, to first order, for each radius; photos that did
     not choose it judge by how much it explains of what is not saturated.
@@ -44,7 +43,7 @@ def bloom(
         return None, Decision("off", "no photos with saturated highlights")
     began, photos = time.perf_counter(), []
     rows = spread(len(views.frames), PHOTOS)
-    for done, photo in enumerate(ahead(lambda row: _Glare.of(model, wet, views, row), rows, THREADS), 1):
+    for done, photo in enumerate(ahead(lambda row: _Glare.of(wet, views, row), rows, THREADS), 1):
         photos.append(photo)
         report("look for bloom", done, len(rows))
     choosing, judging = sum(photos[::2], _Glare.none()), sum(photos[1::2], _Glare.none())
@@ -92,8 +91,9 @@ class _Glare:
         return self.squared - 2 * shares * self.pull + shares**2 * self.pushed
 
     @classmethod
-    def of(cls, model: Model, wet: Found, views: Views, row: int) -> _Glare:
+    def of(cls, wet: Found, views: Views, row: int) -> _Glare:
         """Of the photo of ``row`` among the ``views``."""
+        model = wet.model
         based, gamma = model.photo(views, row), model.state.shared.gamma
         samples, seen = based.samples, based.radiance
         if wet.film is not None:

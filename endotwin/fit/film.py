@@ -24,6 +24,7 @@ from endotwin.cameras import Camera
 from endotwin.effects import Decision
 from endotwin.effects.film import Film as FilmEffect
 from endotwin.fit.gauss_newton import State
+from endotwin.fit.heal import REACH_PX, healed
 from endotwin.fit.lighting import Relighting, lit
 from endotwin.fit.model import at_pixels, radiance
 from endotwin.light import shading
@@ -69,9 +70,6 @@ error of a glint's display values."""
 FAINT = 0.02
 """A vertex whose peak radiance is less has no film."""
 
-REACH_PX = 3
-"""So far from a pixel that shines others may, of which no sample was taken."""
-
 Report = Callable[[str, int, int], None]
 
 
@@ -80,10 +78,12 @@ class Found:
     """Whether there is a film, and why.
 
     Attributes:
-        film, effect: None without one. apart: the film from those photos alone that are not kept apart.
+        model: what is beneath, see ``healed`` where there is a film. film, effect: None without one.
+        apart: the film from those photos alone that are not kept apart.
     """
 
     decision: Decision
+    model: Model
     film: Film | None = None
     effect: FilmEffect | None = None
     apart: Film | None = None
@@ -101,7 +101,7 @@ class Model:
     def film(self, samples: Samples, wanted: str, report: Report) -> Found:
         """The film that the photos call for, or that is ``wanted`` (auto, on or off); and why."""
         if wanted == "off":
-            return Found(Decision("off", "forced off"))
+            return Found(Decision("off", "forced off"), self)
         began = time.perf_counter()
 
         def decided(state: str, reason: str, gain_db: float) -> Decision:
@@ -110,8 +110,11 @@ class Model:
         judges = self.based(samples.thinned(JUDGES, np.random.default_rng(0)))
         most_db = judges.most_db()
         if not judges.shines.any() or (wanted == "auto" and most_db < LEAST_DB):
-            return Found(decided("off", f"glints beyond the model cost {most_db:.2f} dB", most_db))
-        shown = self.based(self._about(judges, report))
+            return Found(decided("off", f"glints beyond the model cost {most_db:.2f} dB", most_db), self)
+        model = replace(self, state=healed(self.state, self.twin.surface, judges.samples, judges.shines))
+        if model.state is not self.state:
+            judges = model.based(judges.samples)
+        shown = model.based(model._about(judges, report))
         glints = _Glints.of(shown, shown.vertices())
         ours = glints[glints.row % APART != APART // 2]
         trials = [ours.fitted(each) for each in ROUGHNESSES]
@@ -119,14 +122,19 @@ class Model:
         # A broader lobe also shines in views that no photo had: the sharpest that predicts about as well.
         best = next(k for k, each in enumerate(gains_db) if each >= max(gains_db) - LEAST_DB)
         gain_db, roughness = gains_db[best], ROUGHNESSES[best]
-        if wanted == "auto" and gain_db < LEAST_DB:
-            return Found(decided("off", "does not predict the glints of other photos", gain_db))
+        judged = len(samples.views.frames) > APART // 2
+        if wanted == "auto" and judged and gain_db < LEAST_DB:
+            return Found(decided("off", "does not predict the glints of other photos", gain_db), self)
         film = glints.fitted(roughness).film(glints)
         reason = f"predicts glints of other photos, on {len(film):,} vertices ({gain_db:+.2f} dB)"
+        if not judged:
+            reason = (
+                f"glints cost {most_db:.2f} dB, on {len(film):,} vertices; no photo is left to judge it by"
+            )
         if wanted == "on":
             reason = f"forced on; {reason}"
-        effect = FilmEffect(roughness=roughness)
-        return Found(decided("on", reason, gain_db), film, effect, trials[best].film(ours))
+        effect, apart = FilmEffect(roughness=roughness), trials[best].film(ours)
+        return Found(decided("on", reason, gain_db if judged else most_db), model, film, effect, apart)
 
     @property
     def guides_mm(self) -> np.ndarray:

@@ -125,7 +125,7 @@ def fit_twin(
         samples = relighting.guided(samples)
         state, normals, left = _find_detail(samples, twin, state, cost, pace, relighting, device)
         twin = replace(twin, surface=replace(surface, normals=normals))
-    film, beyond, why = _beyond(Model(twin, state, relighting, caster), samples, states, pace)
+    wet, beyond, why = _beyond(Model(twin, state, relighting, caster), samples, states, pace)
     odd = unusual(state.shared)
     if odd:
         logger.warning(
@@ -142,7 +142,7 @@ def fit_twin(
         effects = relighting.effects
         for effect in beyond:
             effects = effects.including(effect)
-        fitted = price(_fitted(twin, state, effects, decisions, film), caster, samples.views)
+        fitted = price(_fitted(twin, wet.model.state, effects, decisions, wet.film), caster, samples.views)
     return fitted.with_record(
         fit={"method": "twin", "undetermined": list(start.undetermined), **stopwatch.to_dict()}
     )
@@ -150,26 +150,26 @@ def fit_twin(
 
 def _beyond(
     model: Model, samples: Samples, states: Mapping[str, str], pace: Pace
-) -> tuple[Film | None, list[Effect], dict[str, Decision]]:
+) -> tuple[Found, list[Effect], dict[str, Decision]]:
     """What highlights show beyond the model, as far as there is time: the film, effects that are on, and why
     each is on or off."""
     hurried = Decision("off", "no time to judge")
-    wet, glitter, glare, stage = Found(hurried), (None, hurried), (None, hurried), pace.stopwatch.stage
+    wet, glitter, glare = Found(hurried, model), (None, hurried), (None, hurried)
     specular = "specular" in model.relighting.effects
     film, sparkles, glares = (
         states.get(name, "auto") if specular else "off" for name in ("film", "sparkle", "bloom")
     )
-    with stage("film"):
+    with pace.stopwatch.stage("film"):
         if not pace.out_of_time():
             wet = model.film(samples, film, pace.report)
-    with stage("sparkle"):
+    with pace.stopwatch.stage("sparkle"):
         if not pace.out_of_time():
-            glitter = sparkle(model, wet, samples.views, sparkles, pace.report)
-    with stage("bloom"):
+            glitter = sparkle(wet, samples.views, sparkles, pace.report)
+    with pace.stopwatch.stage("bloom"):
         if not pace.out_of_time():
-            glare = bloom(model, wet, samples, glares, pace.report)
+            glare = bloom(wet, samples, glares, pace.report)
     found = [each for each in (wet.effect, glitter[0], glare[0]) if each is not None]
-    return wet.film, found, {"film": wet.decision, "sparkle": glitter[1], "bloom": glare[1]}
+    return wet, found, {"film": wet.decision, "sparkle": glitter[1], "bloom": glare[1]}
 
 
 def _without_bounce(decision: Decision) -> Decision:

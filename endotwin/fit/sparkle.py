@@ -24,8 +24,9 @@ from scipy.special import exp1, xlogy
 from endotwin.cameras.base import solid_angle
 from endotwin.effects import Decision
 from endotwin.effects.sparkle import Sparkle
-from endotwin.fit.film import APART, GLINT, REACH_PX, Model, Report, exposure_of
+from endotwin.fit.film import APART, GLINT, Model, Report, exposure_of
 from endotwin.fit.film import Found as FoundFilm
+from endotwin.fit.heal import REACH_PX
 from endotwin.light import shading
 from endotwin.light.film import Film, mirrors, mirrors_in_view
 from endotwin.pixels.samples import CLIPPED, Samples, Views
@@ -69,9 +70,7 @@ CERTAIN = 0.02, 0.98
 Slopes = Callable[[np.ndarray, float], np.ndarray]
 
 
-def sparkle(
-    model: Model, wet: FoundFilm, views: Views, wanted: str, report: Report
-) -> tuple[Sparkle | None, Decision]:
+def sparkle(wet: FoundFilm, views: Views, wanted: str, report: Report) -> tuple[Sparkle | None, Decision]:
     """The sparkles that ``views`` show beside a film, or that are ``wanted`` (auto, on or off); and why."""
     if wanted == "off":
         return None, Decision("off", "forced off")
@@ -80,7 +79,7 @@ def sparkle(
     if len(views.frames) <= APART // 2:
         return None, Decision("off", "too few photos to keep some apart")
     began = time.perf_counter()
-    found = _Found.of(model, wet, views, report)
+    found = _Found.of(wet, views, report)
     told = len(found) >= LEAST
     effect, nats = found.measured(views.camera.height) if told else (Sparkle(weight=0.0), 0.0)
     reason = f"{len(found)} small highlights of {found.area_mm2 / 100:.0f} cm² of photos are not the film's"
@@ -242,14 +241,14 @@ class _Found:
         return float(self.all.area_mm2.sum())
 
     @classmethod
-    def of(cls, model: Model, wet: FoundFilm, views: Views, report: Report) -> _Found:
+    def of(cls, wet: FoundFilm, views: Views, report: Report) -> _Found:
         """Those of some of the photos kept apart."""
         rows = np.arange(APART // 2, len(views.frames), APART)
         rows = rows[spread(len(rows), PHOTOS)]
         parts = []
 
         def one(row: int) -> _Found:
-            return cls._of_photo(model, wet, views, row)
+            return cls._of_photo(wet, views, row)
 
         for done, part in enumerate(ahead(one, rows, THREADS), 1):
             parts.append(part)
@@ -257,7 +256,8 @@ class _Found:
         return _joined(parts)
 
     @classmethod
-    def _of_photo(cls, model: Model, wet: FoundFilm, views: Views, row: int) -> _Found:
+    def _of_photo(cls, wet: FoundFilm, views: Views, row: int) -> _Found:
+        model = wet.model
         photo = _Photo.of(model, views, row, wet)
         index, area_px = photo.sparkles()
         at = _Places.of(model, photo, index, wet.apart)
