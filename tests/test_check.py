@@ -2,6 +2,7 @@
 right."""
 
 import json
+import shutil
 from pathlib import Path
 
 import cv2
@@ -21,6 +22,7 @@ from endotwin.check.reading import BASES, Lens, Reading, signed_permutations
 from endotwin.check.stream import sharpness_of
 from endotwin.check.views import read_views
 from endotwin.check.warp import disagreement
+from endotwin.effects.codec import Codec
 from endotwin.errors import SequenceError
 from endotwin.sequence.readers import open_sequence
 
@@ -54,6 +56,17 @@ def test_a_sound_sequence_passes(example):
     report = check(example)
     assert report.consistent and not report.notes
     assert json.loads(json.dumps(report.to_dict()))["consistent"] is True
+
+
+def test_what_a_recorder_did_to_the_photos_is_noted(example, tmp_path):
+    folder = shutil.copytree(example, tmp_path / "coded")
+    for file in folder.glob("*_color.png"):
+        photo = cv2.imread(str(file))[..., ::-1].astype(np.float32) / 255
+        cv2.imwrite(str(file), np.rint(255 * Codec(70).recorded(photo)).astype(np.uint8)[..., ::-1])
+    report = check(folder)
+    assert report.consistent and [note.partition(";")[0] for note in report.notes] == [
+        "codec: the photos were coded as JPEG pictures of quality 70"
+    ]
 
 
 @pytest.mark.parametrize("name", QUICK)

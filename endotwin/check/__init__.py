@@ -35,6 +35,7 @@ from endotwin.check.frames import frame_findings
 from endotwin.check.opening import Opened, depth_fault, opened
 from endotwin.check.photo import Registration, registration
 from endotwin.check.precise import Estimate, estimate
+from endotwin.check.processing import processing
 from endotwin.check.reading import OPENGL, Lens, Reading
 from endotwin.check.search import Candidate, Found, best_reading
 from endotwin.check.views import Views, read_views
@@ -84,7 +85,7 @@ def check(path: Path | str, format: str | None = None, progress: Progress | None
         findings.append(_disagreement(final.median, final.lands, files))
     in_place = photos.judged and photos.flip == "none" and photos.shift == 0
     frames, notes = frame_findings(sequence, written, reading, files.poses, agrees, in_place, progress)
-    notes = [*_limits(views, reading, fine, photos), *notes]
+    notes = [*_limits(views, reading, fine, photos), *notes, *processing(sequence)]
     return Report(
         repr(sequence),
         (*findings, *frames),
