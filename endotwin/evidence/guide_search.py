@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import cache
+from functools import cache, lru_cache
 
 import numpy as np
 from scipy.optimize import least_squares, minimize
@@ -28,6 +28,9 @@ SEARCH_PIXELS = 8_000
 STEPS, POLISH_STEPS = 12, 30
 TOLERANCE = 1e-3
 """The search ends when positions move by less than this share of the ring's radius, or the loss by less."""
+
+SEEN_GUIDES = 64
+"""What so many guides see is kept: of several one is moved at a time."""
 
 DEEPEST = 1.0
 """Of the ring's radius: guides lie at most so far behind the lens."""
@@ -84,6 +87,7 @@ class Search:
         self._at_risk = np.flatnonzero(~np.logical_and.reduce(seen))
         self._radius_mm = float(np.abs(self._candidates).max())
         self.best = cache(self._best)
+        self._seen = lru_cache(SEEN_GUIDES)(lambda guide: probe.visible(np.float32(guide), self._at_risk))
 
     @classmethod
     def of(cls, probe: Probe, base: Hypothesis, glints: Glints) -> Search:
@@ -175,7 +179,7 @@ class Search:
         """Of the pixels under these guides, and of the glints among as many."""
         visible = np.ones((len(self._probe), len(guides_mm)), bool)
         for k, guide in enumerate(guides_mm):
-            visible[self._at_risk, k] = self._probe.visible(guide, self._at_risk)
+            visible[self._at_risk, k] = self._seen(tuple(map(float, guide)))
         diffuse = self._probe.residuals(self._with(guides_mm), self._base, visible)
         return np.r_[diffuse, self._glints.residuals(guides_mm, len(self._probe))]
 
