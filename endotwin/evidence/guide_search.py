@@ -23,7 +23,7 @@ RING_RADII = (0.5, 1.0)
 RING_POINTS = 8
 MOST_GUIDES = 3
 SEARCH_PIXELS = 8_000
-"""Guides are sought with so many pixels of the probe."""
+"""Guides are sought with so many pixels of the probe, and polished with all."""
 
 STEPS, POLISH_STEPS = 12, 30
 TOLERANCE = 1e-3
@@ -67,7 +67,7 @@ def found_guides(probe: Probe, base: Hypothesis, glints: Glints, forced: bool) -
             worth = probe.compare(settled(probe, best, glints), found).keep
         if worth or (forced and best is None and number == MOST_GUIDES):
             best = found
-    return AT_LENS if best is None else Search.of(probe, best.hypothesis, glints).polished()
+    return AT_LENS if best is None else Search(probe, best.hypothesis, glints).polished()
 
 
 def settled(probe: Probe, model: Fitted, glints: Glints) -> Fitted:

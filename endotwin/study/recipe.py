@@ -7,7 +7,7 @@ from pathlib import Path
 
 import yaml
 
-TRANSLATION_MM, ROTATION_DEG = 5, 20
+TRANSLATION_MM, ROTATION_DEG = 5, 8
 
 
 @dataclass(frozen=True)
