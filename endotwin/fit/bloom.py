@@ -18,7 +18,7 @@ from endotwin.run.ahead import ahead
 from endotwin.run.threads import THREADS
 from endotwin.sequence.spread import spread
 
-PHOTOS = 8
+PHOTOS = 4
 """Spread over a sequence: every other one chooses share and radius, the rest judge."""
 
 RADII = 0.003 * 2.0 ** np.arange(5)
