@@ -28,7 +28,7 @@ from endotwin.effects.specular import Specular
 from endotwin.effects.vignetting import Vignetting
 from endotwin.evidence.bounce import bounced, cell_mm
 from endotwin.evidence.glints import Glints
-from endotwin.evidence.guide_search import Guides, Search, found_guides, settled
+from endotwin.evidence.guide_search import Guides, Search, found_guides, polished, settled
 from endotwin.evidence.log_light import Bounced
 from endotwin.evidence.probe import MIN_IMPOSSIBLE_DB, Fitted, Hypothesis, Probe, Verdict
 from endotwin.light.guides import AT_LENS, COSINE, EXPONENTIAL
@@ -92,7 +92,7 @@ def decide(
     kept = trial.shadowed(kept)
     for name in BESIDE:
         kept = trial.beside(name, kept)
-    return trial.decided(trial.without_idle_gain(kept))
+    return trial.decided(trial.polished(trial.without_idle_gain(kept)))
 
 
 class _Trial:
@@ -192,6 +192,15 @@ class _Trial:
         without = self._probe.fit(replace(kept.hypothesis, gain=False))
         self._say("gain", False, self._probe.compare(without, kept))
         return without
+
+    def polished(self, kept: Fitted) -> Fitted:
+        """``kept`` with its guides where their shadows in all pixels say that they are."""
+        if not kept.hypothesis.shadows or kept.hypothesis.guides_mm == AT_LENS or self._late():
+            return kept
+        began = time.perf_counter()
+        found = polished(self._probe, kept, self._glints())
+        self._seconds["offset"] += time.perf_counter() - began
+        return found
 
     def _settled(self, model: Fitted) -> Fitted:
         return settled(self._probe, model, self._glints())

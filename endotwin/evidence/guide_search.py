@@ -23,7 +23,7 @@ RING_RADII = (0.5, 1.0)
 RING_POINTS = 8
 MOST_GUIDES = 3
 SEARCH_PIXELS = 8_000
-"""Guides are sought with so many pixels of the probe, and polished with all."""
+"""Guides are sought with so many pixels of the probe; those that are kept are polished with all."""
 
 STEPS, POLISH_STEPS = 12, 30
 TOLERANCE = 1e-3
@@ -67,12 +67,21 @@ def found_guides(probe: Probe, base: Hypothesis, glints: Glints, forced: bool) -
             worth = probe.compare(settled(probe, best, glints), found).keep
         if worth or (forced and best is None and number == MOST_GUIDES):
             best = found
-    return AT_LENS if best is None else Search(probe, best.hypothesis, glints).polished()
+    return AT_LENS if best is None else Search.of(probe, best.hypothesis, glints).polished()
 
 
 def settled(probe: Probe, model: Fitted, glints: Glints) -> Fitted:
     """``model`` with its guides where they predict best beside all its effects, if that is elsewhere."""
-    guides_mm = Search.of(probe, model.hypothesis, glints).settled()
+    return _moved(probe, model, Search.of(probe, model.hypothesis, glints).settled())
+
+
+def polished(probe: Probe, model: Fitted, glints: Glints) -> Fitted:
+    """``model`` with its guides where all of the probe's pixels say that they are, if that is elsewhere."""
+    return _moved(probe, model, Search(probe, model.hypothesis, glints).polished())
+
+
+def _moved(probe: Probe, model: Fitted, guides_mm: Guides) -> Fitted:
+    """``model`` with guides at ``guides_mm`` where held-out pixels say that it is better so."""
     moved = probe.fit(replace(model.hypothesis, guides_mm=guides_mm))
     return moved if probe.compare(model, moved).gain_db > 0 else model
 
