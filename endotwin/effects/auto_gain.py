@@ -74,12 +74,15 @@ class AutoGain(Effect):
         frames = range(first, min(first + PHOTOS, len(sequence)))
         if len(frames) < FEWEST:
             return None, f"{none}fewer than {FEWEST} photos do not tell how their exposure is set"
+        times_s = sequence.timestamps_s[frames.start : frames.stop]
+        steps_s = np.diff(times_s)
+        if steps_s.min() <= 0:
+            return None, f"{none}the photos have no times that rise"
         try:
             found = Exposures.of(sequence, frames)
         except SequenceError as error:
             return None, f"{none}{error}"
-        times_s = sequence.timestamps_s[frames.start : frames.stop]
-        lags = np.geomspace(np.diff(times_s).mean() / 4, times_s[-1] - times_s[0], LAGS - 1)
+        lags = np.geomspace(steps_s.mean() / 4, steps_s.sum(), LAGS - 1)
         target = float(np.exp(found.log_level.mean()))
         trials = [cls(target=target, lag=float(lag)) for lag in (0.0, *lags)]
         predicted = [np.diff(each.held(found.log_unheld, times_s)) for each in trials]

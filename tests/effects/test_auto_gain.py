@@ -95,6 +95,8 @@ def test_a_camera_that_keeps_its_gain_tells_none(twin, tmp_path):
     sequence = recording(twin, tmp_path / "kept", Noise())
     assert AutoGain.evidence(sequence)[0] is None
     assert np.abs(Exposures.of(sequence, range(120)).log_change).max() < 0.01
+    timeless = replace(sequence, timestamps_s=np.zeros(len(sequence)))
+    assert AutoGain.evidence(timeless)[0] is None
 
 
 @pytest.mark.parametrize(
