@@ -14,9 +14,9 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from endotwin.align.photos import DARKEST, Photo, gradient, log_blurred
-from endotwin.align.scene import LEAST_COSINE, Scene, by_twist, dilated, shading_columns
+from endotwin.align.scene import LEAST_COSINE, Scene, by_twist, shading_columns
 from endotwin.light.incidence import incidence
-from endotwin.surface.silhouettes import discontinuities
+from endotwin.surface.silhouettes import dilated, discontinuities
 
 BAND_SIGMAS = 2.5
 """A rim shows within so many widths of the blur."""

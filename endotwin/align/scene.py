@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-import cv2
 import numpy as np
 
 from endotwin.cameras import Camera
@@ -128,8 +127,3 @@ def _by_direction(camera: Camera) -> np.ndarray:
     gram[~sound] = np.eye(2)
     inverse = np.einsum("...ij,...kj->...ik", np.linalg.inv(gram), along)
     return np.where(sound[..., None, None], inverse, 0).reshape(-1, 2, 3).astype(np.float32)
-
-
-def dilated(mask: np.ndarray, radius: int) -> np.ndarray:
-    """Bool [H, W]: pixels within a square of ``radius`` about those of ``mask``."""
-    return cv2.dilate(mask.astype(np.uint8), np.ones((2 * radius + 1,) * 2, np.uint8)) > 0

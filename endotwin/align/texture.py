@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 
 from endotwin.align.photos import Photo, gradient
-from endotwin.align.scene import Scene, by_twist, dilated, shading_columns, shading_slopes
-from endotwin.surface.silhouettes import discontinuities
+from endotwin.align.scene import Scene, by_twist, shading_columns, shading_slopes
+from endotwin.surface.silhouettes import dilated, discontinuities
 
 GRAZING, SHINY = 0.1, 0.92
 """Least and largest n·ω of a vertex that tells: beyond, it lies at a rim, or in a highlight."""

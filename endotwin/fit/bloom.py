@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 import torch
 
@@ -17,6 +16,7 @@ from endotwin.pixels.samples import CLIPPED, Samples, Views
 from endotwin.run.ahead import ahead
 from endotwin.run.threads import THREADS
 from endotwin.sequence.spread import spread
+from endotwin.surface.silhouettes import dilated
 
 PHOTOS = 4
 """Spread over a sequence: every other one chooses share and radius, the rest judge."""
@@ -103,8 +103,7 @@ class _Glare:
         beyond.reshape(-1, 3)[pixel] = (seen - SATURATION).clamp(min=0)
         saturated = (beyond > 0).any(axis=2)
         saturated.flat[pixel] |= (samples.color >= CLIPPED).any(dim=1).numpy()
-        near = cv2.dilate(saturated.astype(np.uint8), np.ones((2 * BESIDE_PX + 1,) * 2, np.uint8))
-        told = near.flat[pixel] == 0
+        told = ~dilated(saturated, BESIDE_PX).flat[pixel]
         pixel, seen = pixel[told], seen[told]
         error = (based.shown[told] - shading.respond(seen, gamma)).double().numpy()
         slope = (gamma * (seen + shading.RADIANCE_MIN) ** (gamma - 1)).double().numpy()

@@ -13,7 +13,6 @@ import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 
-import cv2
 import numpy as np
 import torch
 from scipy.sparse import csr_array
@@ -34,6 +33,7 @@ from endotwin.pixels.samples import Samples, Views, frame_samples
 from endotwin.run.ahead import ahead
 from endotwin.run.threads import THREADS
 from endotwin.surface.casting import Caster
+from endotwin.surface.silhouettes import dilated
 from endotwin.twin import Twin
 
 GLINT = 0.1
@@ -187,11 +187,11 @@ class Model:
 
 def _splatted(camera: Camera, points_mm: np.ndarray) -> np.ndarray:
     """Bool [H, W]: pixels within REACH_PX of where ``points_mm`` [N, 3] (camera frame) are seen."""
-    seen = np.zeros((camera.height, camera.width), np.uint8)
+    seen = np.zeros((camera.height, camera.width), bool)
     uv = np.rint(camera.project(points_mm[points_mm[:, 2] > 0])).astype(np.int64)
     inside = ((uv >= 0) & (uv < (camera.width, camera.height))).all(axis=1)
     seen[uv[inside, 1], uv[inside, 0]] = 1
-    return cv2.dilate(seen, np.ones((2 * REACH_PX + 1,) * 2, np.uint8)) > 0
+    return dilated(seen, REACH_PX)
 
 
 @dataclass(frozen=True)

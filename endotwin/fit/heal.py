@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import cv2
 import numpy as np
 import scipy.sparse
 import torch
@@ -14,6 +13,7 @@ from endotwin.fit.gauss_newton import State
 from endotwin.fusion.smooth import neighbour_mean
 from endotwin.pixels.samples import Samples
 from endotwin.surface import Surface
+from endotwin.surface.silhouettes import dilated
 
 REACH_PX = 3
 """So far from a pixel that shines its blur goes, and others may shine of which no sample was taken."""
@@ -28,9 +28,9 @@ def near(samples: Samples, chosen: torch.Tensor) -> np.ndarray:
     row, pixel = views.row(samples.frame), samples.pixel.numpy()
     for each in np.unique(row[chosen.numpy()]):
         of_photo = row == each
-        image = np.zeros(views.lens_mask.shape, np.uint8)
+        image = np.zeros(views.lens_mask.shape, bool)
         image.flat[pixel[of_photo & chosen.numpy()]] = 1
-        found[of_photo] = cv2.dilate(image, np.ones((2 * REACH_PX + 1,) * 2, np.uint8)).flat[pixel[of_photo]]
+        found[of_photo] = dilated(image, REACH_PX).flat[pixel[of_photo]]
     return found
 
 

@@ -34,6 +34,7 @@ from endotwin.run.ahead import ahead
 from endotwin.run.threads import THREADS
 from endotwin.sequence.spread import spread
 from endotwin.surface.rows import Rows
+from endotwin.surface.silhouettes import dilated
 from endotwin.surface.vectors import dot, unit
 
 PHOTOS = 6
@@ -117,12 +118,11 @@ class _Photo:
         least = shading.radiance_of(shown + GLINT, gamma) - beyond.numpy()
         excess = shading.radiance_of(based.shown.numpy(), gamma) - beyond.numpy()
         shape, pixel = views.lens_mask.shape, samples.pixel.numpy()
-        filmed = np.zeros(shape, np.uint8)
+        filmed = np.zeros(shape, bool)
         filmed.flat[pixel[(shown - based.predicted().numpy())[:, 1:].min(axis=1) > GLINT]] = 1
-        filmed = cv2.dilate(filmed, np.ones((2 * REACH_PX + 1,) * 2, np.uint8))
         image = np.full(shape, np.nan, np.float32)
         image.flat[pixel] = excess[:, 1:].min(axis=1)
-        return cls(samples, image, least[:, 1:].max(axis=1), filmed.flat[pixel] == 0)
+        return cls(samples, image, least[:, 1:].max(axis=1), ~dilated(filmed, REACH_PX).flat[pixel])
 
     def sparkles(self) -> tuple[np.ndarray, np.ndarray]:
         """Small highlights, M of them: the sample at the top of each, int [M], and its area, px [M]."""

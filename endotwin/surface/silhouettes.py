@@ -16,3 +16,8 @@ def discontinuities(depth_mm: np.ndarray) -> np.ndarray:
     depth_mm = np.nan_to_num(depth_mm, posinf=0)
     farthest, nearest = cv2.dilate(depth_mm, kernel), cv2.erode(depth_mm, kernel)
     return (farthest > 0) & ~(farthest - nearest <= SILHOUETTE * depth_mm)
+
+
+def dilated(mask: np.ndarray, radius: int) -> np.ndarray:
+    """Bool [H, W]: pixels within a square of ``radius`` about those of ``mask``."""
+    return cv2.dilate(mask.astype(np.uint8), np.ones((2 * radius + 1,) * 2, np.uint8)) > 0
