@@ -72,10 +72,8 @@ class Chroma(Effect):
             return None, "rendered on request: the photos' finest detail does not lack colour"
         if Codec.evidence(sequence)[0] is not None:
             return None, "the photos' colour is at half its size, as the codec leaves it"
-        return (
-            cls(),
-            f"the photos' finest detail has {max(share, 0):.0%} of the colour that broader detail has",
-        )
+        told = f"the photos' finest detail has {max(share, 0):.0%} of the colour that broader detail has"
+        return cls(), told
 
 
 def _share_of_colour(broad: np.ndarray, finest: np.ndarray) -> float:
@@ -94,9 +92,8 @@ def _details(photo: np.ndarray, lit: np.ndarray) -> np.ndarray:
     usable = lit & (photo.min(axis=2) > 0) & (photo.max(axis=2) < 255)
     image = photo @ YCBCR.T
     spectra = (_of_runs(image, usable) + _of_runs(image.swapaxes(0, 1), usable.T)) / 2
-    return np.stack(
-        [spectra[:, BROAD].mean(axis=1), spectra[:, FINEST].mean(axis=1), _of_pairs(image, usable)]
-    )
+    broad, finest = (spectra[:, each].mean(axis=1) for each in (BROAD, FINEST))
+    return np.stack([broad, finest, _of_pairs(image, usable)])
 
 
 def _of_pairs(image: np.ndarray, usable: np.ndarray) -> np.ndarray:

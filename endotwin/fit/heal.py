@@ -22,7 +22,7 @@ LEAST_SEEN = 0.5
 """Pixels off glints by which a vertex' materials are told."""
 
 
-def near(samples: Samples, chosen: torch.Tensor) -> np.ndarray:
+def _near(samples: Samples, chosen: torch.Tensor) -> np.ndarray:
     """Bool [N]: samples within REACH_PX of one that is ``chosen``, bool [N], in its photo."""
     found, views = np.zeros(len(samples), bool), samples.views
     row, pixel = views.row(samples.frame), samples.pixel.numpy()
@@ -38,7 +38,7 @@ def healed(state: State, surface: Surface, samples: Samples, shines: torch.Tenso
     """``state`` with harmonic materials (θ at a vertex the mean of its neighbours') where ``samples`` show
     nothing but what ``shines``, bool [N], and pixels about it."""
     corners, share = surface.triangles[samples.triangle.numpy()], samples.barycentric.numpy()
-    beside, count = near(samples, shines), len(surface.vertices_mm)
+    beside, count = _near(samples, shines), len(surface.vertices_mm)
 
     def weight(chosen: np.ndarray) -> np.ndarray:
         return np.bincount(corners[chosen].ravel(), share[chosen].ravel(), count)
