@@ -4,17 +4,25 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from independent.gloss import Gloss
 
 from endotwin.fusion.mesh import surface_of
 from endotwin.light.bounced import GAMMA_STEP, Albedo, BouncedLight, Places
 from endotwin.light.forward import Lobes
 from endotwin.light.guides import AT_LENS, COSINE
 from endotwin.light.radiosity import Radiosity
+from endotwin.light.shading import F0_DIELECTRIC, ROUGHNESS_TISSUE
 from endotwin.surface.casting import Caster
 
 RADIUS_MM = 10.0
 BASE_COLOR, ROUGHNESS = 0.5, 0.4
 WET = Lobes(0.04, coat=(0.8, 0.12, 2.0))
+HEAD_ON = float(
+    Gloss(F0_DIELECTRIC).at(np.ones(1), np.array([ROUGHNESS_TISSUE]))[0]
+    / Lobes(F0_DIELECTRIC).glossy_albedo(torch.tensor(ROUGHNESS_TISSUE))
+)
+"""Of head-on light tissue's lobe reflects so much of what it does of light from all around."""
+
 GLOSSY = float(WET.glossy_albedo(torch.tensor(ROUGHNESS)))
 
 
@@ -31,21 +39,17 @@ def sphere() -> tuple[BouncedLight, Places, Albedo]:
     return light, Places(radiosity.to_vertex, np.arange(count) % 2), albedo
 
 
-def series(albedo: float) -> float:
-    """E/E_direct = (ρ + ρ² + …)/2 of a light that faces half the sphere (Ulbricht's integrating sphere)."""
-    return albedo / (1 - albedo) / 2
-
-
-def test_base_color_and_gloss_both_send_light_back(sphere):
+@pytest.mark.parametrize("log_scale", [0.0, 0.3])
+def test_base_color_sends_light_back_evenly_and_gloss_head_on_light_across(sphere, log_scale):
+    """Both in the same amount as ever after; at first lobes send their share of head-on light back."""
     light, places, albedo = sphere
-    bounced = light.at(places, n=0.0, q=2.0, albedo=albedo.scaled(0.0))
-    np.testing.assert_allclose(bounced, series(BASE_COLOR + GLOSSY) / RADIUS_MM**2, rtol=0.05)
-    assert bounced.mean() == pytest.approx(series(BASE_COLOR + GLOSSY) / RADIUS_MM**2, rel=0.01)
-    brighter = light.at(places, n=0.0, q=2.0, albedo=albedo.scaled(0.3))
-    np.testing.assert_allclose(brighter, series(BASE_COLOR * np.exp(0.3) + GLOSSY) / RADIUS_MM**2, rtol=0.05)
-    assert brighter.mean() == pytest.approx(
-        series(BASE_COLOR * np.exp(0.3) + GLOSSY) / RADIUS_MM**2, rel=0.01
-    )
+    bounced = light.at(places, n=0.0, q=2.0, albedo=albedo.scaled(log_scale)) * RADIUS_MM**2
+    color, white = BASE_COLOR * np.exp(log_scale), GLOSSY * HEAD_ON
+    mean = (color + white) / (1 - color - GLOSSY) / 2
+    assert bounced.mean() == pytest.approx(mean, rel=0.01)
+    z_mm = places.weights @ light._radiosity.centre_mm[:, 2]
+    lit, dark = (bounced[side].mean() for side in (z_mm > RADIUS_MM / 2, z_mm < -RADIUS_MM / 2))
+    assert dark - lit > white / 2
 
 
 def test_one_view_is_as_one_of_several(sphere):

@@ -6,7 +6,7 @@ n and q and of how bright the tissue is.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.sparse
@@ -55,9 +55,9 @@ class Albedo:
         mean = radiosity.mean(sum(corners) / np.float32(3))
         return cls(mean[:, :3], mean[:, 3:])
 
-    def scaled(self, log_scale: float) -> np.ndarray:
-        """In all, [P, 3], with base colours brighter by a factor whose logarithm is ``log_scale``."""
-        return np.exp(log_scale) * self.base_color + self.glossy
+    def scaled(self, log_scale: float) -> Albedo:
+        """With base colours brighter by a factor whose logarithm is ``log_scale``."""
+        return replace(self, base_color=np.exp(log_scale) * self.base_color)
 
 
 @dataclass(frozen=True)
@@ -140,11 +140,16 @@ class BouncedLight:
             [radiosity.lamp(pose, np.asarray(guide), profile) for guide in guides_mm]
             for pose in T_local_camera
         ]
+        middle_mm = np.mean(np.asarray(guides_mm), axis=0)
+        self._mirrors = [
+            radiosity.mirror_factors(pose[:3, 3] + pose[:3, :3] @ middle_mm, lamps)
+            for pose, lamps in zip(T_local_camera, self._lamps, strict=True)
+        ]
 
-    def at(self, places: Places, n: float, q: float, albedo: np.ndarray) -> np.ndarray:
-        """Irradiance float32 [N, 3] with L0 = 1 and patches of ``albedo`` [P, 3]."""
-        direct = [self._radiosity.direct(lamps, n, q).mean(axis=1) for lamps in self._lamps]
-        return places.of(self._radiosity.indirect(np.stack(direct, axis=1), albedo))
+    def at(self, places: Places, n: float, q: float, albedo: Albedo) -> np.ndarray:
+        """Irradiance float32 [N, 3] with L0 = 1 and patches of ``albedo``."""
+        direct = np.stack([self._radiosity.direct(lamps, n, q).mean(axis=1) for lamps in self._lamps], axis=1)
+        return places.of(self._radiosity.indirect(direct, albedo.base_color, albedo.glossy, self._mirrors))
 
     def expanded(
         self,

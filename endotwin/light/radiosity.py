@@ -3,7 +3,8 @@ light.
 
 The surface is gathered into patches. Once, cosine-weighted rays from each patch count which patches it sees:
 the form factors K (Goral et al. 1984; Monte Carlo estimate, Cohen & Wallace 1993, ch. 4). Then the indirect
-irradiance E under any light is E = K·ρ(E_direct + E), a few sparse products a bounce.
+irradiance E under any light is E = K·ρ(E_direct + E), a few sparse products a bounce; what white lobes make
+of direct light is not even, and has factors of its own (``mirror``).
 
 A lumen is closed, and a mesh of what depth maps showed is not: from half of a wall's directions comes light
 of tissue that nobody saw. The surface's wall stands for it, with the albedo of the nearest patch that was
@@ -13,6 +14,7 @@ UNSEEN_DIRECT of the direct one: a light beside the camera hardly reaches what t
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -24,12 +26,16 @@ from scipy.spatial import cKDTree
 
 from endotwin.light.guides import SHADOW_BIAS, log_axis
 from endotwin.light.incidence import COS_MIN, DISTANCE_MIN_MM
+from endotwin.light.mirror import mirrored
 from endotwin.surface import Surface
 from endotwin.surface.casting import Caster
 from endotwin.surface.vectors import dot, unit
 
 RAYS = 256
 """Rays of a patch that count its form factors: one part in 16 of noise, and half of that after a bounce."""
+
+FACETS = 16
+"""Of each such point that is lit, in which it mirrors light."""
 
 POINTS = 4
 """Points of a patch at which direct light is evaluated."""
@@ -103,16 +109,18 @@ class Radiosity:
         ]
         self.patch_of = pieces[0]
         self.count = int(self.patch_of.max()) + 1
-        patch = np.r_[pieces[0], self.count + pieces[1]]
-        self._draw = _Draw(patch, double_area, int(patch.max()) + 1)
-        self._whole = Caster(whole) if len(surface.wall_triangles) else caster
-        self.form_factors = self._counted(corners, normal, patch, rays, generator)
+        self._whole_patch = np.r_[pieces[0], self.count + pieces[1]]
+        self._area_mm2 = np.bincount(self._whole_patch, double_area / 2)
+        self._draw = _Draw(self._whole_patch, double_area, len(self._area_mm2))
+        self._whole, self._front = Caster(whole) if len(surface.wall_triangles) else caster, normal
+        self.form_factors = self._counted(corners, rays, generator)
         met = np.asarray(self.form_factors.sum(axis=1)).ravel()
         self.unseen = ((1 - met) / np.maximum(met, LEAST_SEEN)).astype(np.float32)
         self._drawn = self._draw(POINTS, generator)
         self._weights = _weights(len(self._drawn), generator)
         self._points_mm = _mixed(self._weights, corners[self._drawn])
         self._normals = normal[self._drawn]
+        self._facets = generator.random((len(self._drawn), 2), np.float32)
         centre_mm = _mean_of_points(self._points_mm)
         self.centre_mm = centre_mm[: self.count]
         self._facing = unit(_mean_of_points(self._normals[: self.count * POINTS]))
@@ -187,22 +195,57 @@ class Radiosity:
             axis=1,
         )
 
-    def indirect(self, direct: np.ndarray, albedo: np.ndarray) -> np.ndarray:
-        """Indirect irradiance float32 [P, M, 3] of ``direct`` [P + W, M] light, with patch ``albedo``
-        [P, 3]."""
-        albedo = np.concatenate([albedo, albedo[self._like]])
-        albedo = np.clip(albedo, 0, ALBEDO_MAX).astype(np.float32)[:, None]
+    def mirror_factors(self, source_mm: np.ndarray, lamps: Sequence[Lamp]) -> scipy.sparse.csr_array:
+        """Irradiance that patches' white lobes throw on: CSR [P + W, P + W], to be multiplied with ρ·E, E the
+        direct light by ``lamps`` about ``source_mm`` [3] and ρ what lobes send back of light from all around.
+        """
+        cos = sum(lamp.cos for lamp in lamps)
+        share = (cos / np.maximum(cos.sum(axis=1, keepdims=True), np.finfo(np.float32).tiny)).ravel()
+        lit = np.flatnonzero(share)
+        points_mm, normals = self._points_mm[lit], self._normals[lit]
+        to_light = unit(source_mm.astype(np.float32) - points_mm)
+        direction, thrown = mirrored(normals, to_light, self._facets[lit], FACETS)
+        point, patch = (np.repeat(x, FACETS) for x in (np.arange(len(lit)), lit // POINTS))
+        sent = np.flatnonzero(thrown)
+        origin_mm = (points_mm + self._lift_mm * normals)[point[sent]]
+        landed, met = self._landed(origin_mm, direction[sent])
+        sent = sent[landed]
+        patch, share = patch[sent], share[lit][point[sent]]
+        thrown = thrown[sent] * share * self._area_mm2[patch] / self._area_mm2[met]
+        return self._matrix(thrown.astype(np.float32), met, patch)
+
+    def indirect(
+        self,
+        direct: np.ndarray,
+        color: np.ndarray,
+        glossy: np.ndarray | float = 0.0,
+        mirrors: Sequence[scipy.sparse.csr_array] = (),
+    ) -> np.ndarray:
+        """Indirect irradiance float32 [P, M, 3] of ``direct`` [P + W, M] light.
+
+        Args:
+            color: [P, 3], share of all light that patches send back evenly. glossy: [P, 1], that of their
+                white lobes: of direct light by ``mirrors``, M of ``mirror_factors``, of all other evenly.
+        """
+        glossy = np.broadcast_to(np.asarray(glossy, np.float32), (len(color), 1))
+        color, glossy = (
+            np.concatenate([x, x[self._like]])[:, None].astype(np.float32) for x in (color, glossy)
+        )
         unseen = self.unseen[:, None, None]
 
-        def thrown(irradiance: np.ndarray, unseen_share: float) -> np.ndarray:
+        def thrown(irradiance: np.ndarray, albedo: np.ndarray, unseen_share: float) -> np.ndarray:
+            albedo = np.clip(albedo, 0, ALBEDO_MAX)
             radiosity = (albedo * irradiance).reshape(len(irradiance), -1)
             met = (self.form_factors @ radiosity).reshape(irradiance.shape)
             return met * (1 + unseen_share * unseen)
 
-        added = thrown(np.repeat(direct[..., None].astype(np.float32), 3, axis=2), UNSEEN_DIRECT)
+        each = np.repeat(direct[..., None].astype(np.float32), 3, axis=2)
+        added = thrown(each, color, UNSEEN_DIRECT)
+        for view, mirror in enumerate(mirrors):
+            added[:, view] += (mirror @ (glossy[:, 0] * direct[:, view, None])).astype(np.float32)
         total = added.copy()
         for _ in range(BOUNCES - 1):
-            before, added = added.sum(axis=0), thrown(added, 1.0)
+            before, added = added.sum(axis=0), thrown(added, color + glossy, 1.0)
             total += added
         ratio = np.clip(added.sum(axis=0) / np.maximum(before, np.finfo(np.float32).tiny), 0, ALBEDO_MAX)
         return (total + added * (ratio / (1 - ratio)))[: self.count]
@@ -214,23 +257,27 @@ class Radiosity:
         return np.stack(sums, axis=1) / np.maximum(total, np.finfo(np.float64).tiny)[:, None]
 
     def _counted(
-        self,
-        corners: np.ndarray,
-        normal: np.ndarray,
-        patch: np.ndarray,
-        rays: int,
-        generator: np.random.Generator,
+        self, corners: np.ndarray, rays: int, generator: np.random.Generator
     ) -> scipy.sparse.csr_array:
         triangle = self._draw(rays, generator)
-        direction = _cosine_weighted(normal[triangle], generator)
-        hit, _, _ = self._whole.cast_rays(
-            _inside(corners[triangle], generator) + self._lift_mm * normal[triangle], direction
-        )
-        origin = patch[triangle]
+        normal = self._front[triangle]
+        direction = _cosine_weighted(normal, generator)
+        origin_mm = _inside(corners[triangle], generator) + self._lift_mm * normal
+        landed, met = self._landed(origin_mm, direction)
+        each = np.full(len(landed), 1 / rays, np.float32)
+        return self._matrix(each, self._whole_patch[triangle[landed]], met)
+
+    def _landed(self, origin_mm: np.ndarray, direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Which of N rays meet the front of a patch, int [L], and what patch, [L]."""
+        hit, _, _ = self._whole.cast_rays(origin_mm, direction)
         landed = np.flatnonzero(hit >= 0)
-        landed = landed[dot(normal[hit[landed]], direction[landed]) < 0]
-        entries = (np.full(len(landed), 1 / rays, np.float32), (origin[landed], patch[hit[landed]]))
-        return scipy.sparse.csr_array(scipy.sparse.coo_array(entries, shape=(patch.max() + 1,) * 2))
+        landed = landed[dot(self._front[hit[landed]], direction[landed]) < 0]
+        return landed, self._whole_patch[hit[landed]]
+
+    def _matrix(self, values: np.ndarray, rows: np.ndarray, columns: np.ndarray) -> scipy.sparse.csr_array:
+        """Sums of ``values`` [N] by patches, CSR [P + W, P + W]."""
+        shape = (len(self._area_mm2),) * 2
+        return scipy.sparse.csr_array(scipy.sparse.coo_array((values, (rows, columns)), shape=shape))
 
 
 class _Draw:

@@ -109,8 +109,12 @@ def specular(
     """White GGX lobe f_s = D·F·G / (4 cos_i cos_o), [N]; ``cos_d`` = wi·wm enters Schlick's F = f0 + (1 −
     f0)(1 − cos_d)⁵.
     """
-    fresnel = f0 + (1 - f0) * (1 - cos_d) ** 5
-    return specular_lobe(cos_i, cos_o, sin2_m, roughness) * fresnel
+    return specular_lobe(cos_i, cos_o, sin2_m, roughness) * schlick(cos_d, f0)
+
+
+def schlick(cos_d: Tensor, f0: Tensor | float) -> Tensor:
+    """Fresnel's reflectance [N], f0 head on (Schlick 1994)."""
+    return f0 + (1 - f0) * (1 - cos_d) ** 5
 
 
 def specular_lobe(cos_i: Tensor, cos_o: Tensor, sin2_m: Tensor, roughness: Tensor) -> Tensor:

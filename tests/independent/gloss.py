@@ -6,7 +6,8 @@ from functools import cached_property
 
 import numpy as np
 
-from independent.wall import sampled
+from independent.light import dot
+from independent.wall import about, sampled
 
 NODES = 33
 FACETS = 24
@@ -21,7 +22,7 @@ class Gloss:
     """
 
     def __init__(self, f0: float):
-        self._f0 = f0
+        self.f0 = f0
 
     def at(self, cos: np.ndarray, roughness: np.ndarray) -> np.ndarray:
         """R of cosines [N] and roughnesses [N], [N]."""
@@ -46,5 +47,22 @@ class Gloss:
         passed = np.where((facing > 0) & (cos_i > 0), facing / (cos_m * cos), 0)
         for c in (cos, np.maximum(cos_i, 1e-4)):
             passed = passed * 2 / (1 + np.sqrt(1 + alpha**2 * (1 / c**2 - 1)))
-        fresnel = self._f0 + (1 - self._f0) * (1 - np.clip(facing, 0, 1)) ** 5
+        fresnel = self.f0 + (1 - self.f0) * (1 - np.clip(facing, 0, 1)) ** 5
         return (fresnel * passed).mean(axis=2)[..., None]
+
+
+def reflected(
+    normals: np.ndarray, to_light: np.ndarray, roughness: np.ndarray, f0: float, u: np.ndarray, v: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Directions [N, 3] in which facets drawn by u, v in [0, 1) reflect light from unit ``to_light`` [N, 3],
+    and the share of it that each stands for, whose mean is the directional albedo (eqs. 35, 36 and 41)."""
+    alpha2 = roughness**4
+    cos_m = np.sqrt((1 - u) / (1 + (alpha2 - 1) * u))
+    facets = about(normals, cos_m, v)
+    facing, cos_i = dot(to_light, facets), dot(to_light, normals)
+    out = 2 * facing[:, None] * facets - to_light
+    cos_o = dot(out, normals)
+    share = np.where((facing > 0) & (cos_o > 0), facing / (cos_m * np.maximum(cos_i, 1e-4)), 0)
+    for cos in (cos_i, cos_o):
+        share = share * 2 / (1 + np.sqrt(1 + alpha2 * (1 / np.maximum(cos, 1e-4) ** 2 - 1)))
+    return out, share * (f0 + (1 - f0) * (1 - np.clip(facing, 0, 1)) ** 5)

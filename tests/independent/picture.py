@@ -141,15 +141,19 @@ class Studio:
 
     def _transported(self, rng: np.random.Generator) -> Bounce:
         """The light between tissue and tissue in every frame, for L0 = 1."""
-        radiosity = Radiosity(self.wall, self.tissue, rng)
-        roughness = radiosity.tissue[:, 3]
-        glossy = self._gloss.mean(roughness)
-        if "coat" in self.scene.effects:
-            film = self._film.mean(np.full_like(roughness, self.scene.coat_roughness))
-            glossy = glossy + self.scene.coat_weight * film
-        lamp = replace(self.scene.lamp, L0=1.0)
+        scene, radiosity = self.scene, Radiosity(self.wall, self.tissue, rng)
+        lamp, rough = replace(scene.lamp, L0=1.0), radiosity.tissue[:, 3]
+        lobes = [(self._gloss, 1.0, rough)]
+        if "coat" in scene.effects:
+            lobes.append((self._film, scene.coat_weight, np.full_like(rough, scene.coat_roughness)))
         direct = np.stack([radiosity.direct(lamp, pose) for pose in self.poses], axis=1)
-        return radiosity.bounce(direct, radiosity.tissue[:, :3] + glossy[:, None])
+        glossy, mirrored = np.zeros_like(rough), np.zeros_like(direct)
+        for lobe, weight, roughness in lobes:
+            glossy = glossy + weight * lobe.mean(roughness)
+            for frame, pose in enumerate(self.poses):
+                found = radiosity.mirrored(lamp, pose, roughness, lobe.f0, rng)
+                mirrored[:, frame] += weight * found
+        return radiosity.bounce(direct, radiosity.tissue[:, :3], glossy, mirrored)
 
     def _expose(self) -> None:
         """Set L0 by what a coarse look at all frames shows."""

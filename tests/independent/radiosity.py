@@ -1,24 +1,30 @@
-"""Diffuse light between all parts of a wall, to the end of its bounces.
+"""Light between all parts of a wall, to the end of its bounces.
 
 Patches are blocks of the grid. E = K·ρ·(E_direct + E) with K the share of a patch's cosine-weighted rays that
-end on each other patch (Goral et al. 1984). From patch to patch all reflection is diffuse.
+end on each other patch (Goral et al. 1984). What white lobes make of a lamp's light goes where their facets
+mirror it; all other reflection from patch to patch is diffuse.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 import scipy.sparse
 
+from independent.gloss import reflected
 from independent.light import Lamp, dot
-from independent.wall import Wall, sampled, unit
+from independent.wall import Wall, about, sampled, unit
 
 BLOCK = 4
 """Quads of a patch, each way."""
 
 STRATA = 24
 """Rays of a patch: their squared number, one in each cell of the unit square."""
+
+FACETS = 4
+"""That a guide lights in each triangle."""
 
 AT_ONCE = 512
 LIFT = 1e-4
@@ -46,7 +52,7 @@ class Radiosity:
     """Patches of a wall, [R, C] of them, with the map ``tissue`` [H, W, K] over it.
 
     Attributes:
-        shape: R, C. tissue: float32 [P, K], means over the patches.
+        shape: R, C. area_mm2: [P]. tissue: float32 [P, K], means over the patches.
         patch_of: int [T], patch of each triangle. form_factors: CSR [P, P]; a row sums to 1 where the wall is
         closed.
     """
@@ -57,10 +63,11 @@ class Radiosity:
         corners = wall.vertices_mm[wall.triangles]
         self._centres_mm = corners.mean(axis=1)
         self._normals = unit(wall.doubled_area).astype(np.float32)
-        area = np.sqrt((wall.doubled_area**2).sum(axis=1))
+        self._area = area = np.sqrt((wall.doubled_area**2).sum(axis=1)) / 2
         self._triangles = self._of_blocks()
         share = area[self._triangles]
-        self._share = (share / np.maximum(share.sum(axis=1, keepdims=True), 1e-20)).astype(np.float32)
+        self.area_mm2 = share.sum(axis=1)
+        self._share = (share / np.maximum(self.area_mm2[:, None], 1e-20)).astype(np.float32)
         self.patch_of = np.empty(len(area), np.int64)
         self.patch_of[self._triangles] = np.arange(len(self._triangles))[:, None]
         self.form_factors = self._counted(corners, rng)
@@ -71,31 +78,60 @@ class Radiosity:
 
     def direct(self, lamp: Lamp, pose: np.ndarray) -> np.ndarray:
         """Irradiance float32 [P] that the lamp of a camera at ``pose`` [4, 4] throws on the patches."""
+        total = np.zeros(len(self._centres_mm))
+        for triangles, irradiance, _ in self._lit(lamp, pose):
+            total[triangles] += irradiance
+        return self._mean(total[:, None])[:, 0].astype(np.float32)
+
+    def mirrored(
+        self, lamp: Lamp, pose: np.ndarray, roughness: np.ndarray, f0: float, rng: np.random.Generator
+    ) -> np.ndarray:
+        """Irradiance float32 [P] of that lamp's light where facets of patches of ``roughness`` [P] mirror it:
+        each triangle's flux follows a few of its facets, drawn by their visible share."""
+        flux, lift_mm = np.zeros(len(self._triangles)), LIFT * float(np.ptp(self._centres_mm, axis=0).max())
+        for triangles, irradiance, to_light in self._lit(lamp, pose):
+            each = np.repeat(np.arange(len(triangles)), FACETS)
+            normals, draw = self._normals[triangles][each], rng.random((len(each), 2))
+            rough = roughness[self.patch_of[triangles]][each]
+            out, share = reflected(normals, to_light[each], rough, f0, draw[:, 0], draw[:, 1])
+            hit = self._wall.hit_triangle(self._centres_mm[triangles][each] + lift_mm * normals, out)
+            landed = (hit >= 0) & (share > 0)
+            sent = share * (irradiance * self._area[triangles])[each] / FACETS
+            flux += np.bincount(self.patch_of[hit[landed]], sent[landed], len(flux))
+        return (flux / self.area_mm2).astype(np.float32)
+
+    def bounce(
+        self, direct: np.ndarray, color: np.ndarray, glossy: np.ndarray, mirrored: np.ndarray
+    ) -> Bounce:
+        """All light between patches [P] for direct irradiance [P, F], of which ``mirrored`` [P, F] is what
+        white lobes throw on; they send ``glossy`` [P] of all other light back, and diffuse ones ``color``
+        [P, 3]."""
+        color, direct = color[:, None].astype(np.float32), direct[..., None]
+        albedo = color + glossy[:, None, None].astype(np.float32)
+        arriving = np.zeros(np.broadcast_shapes(color.shape, direct.shape), np.float32)
+        for _ in range(MOST_BOUNCES):
+            leaving = color * direct + albedo * arriving
+            before = arriving
+            met = self.form_factors @ leaving.reshape(len(direct), -1)
+            arriving = met.reshape(arriving.shape) + mirrored[..., None]
+            if np.abs(arriving - before).max() <= CONVERGED * arriving.max():
+                break
+        leaving = albedo * (direct + arriving)
+        return Bounce(*(np.moveaxis(x, 1, 0).reshape(-1, *self.shape, 3) for x in (arriving, leaving)))
+
+    def _lit(self, lamp: Lamp, pose: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+        """Of each guide the triangles int [N] that it lights, their irradiance [N] and directions [N, 3] to
+        it."""
         rotation, centre = pose[:3, :3], pose[:3, 3]
         points_mm = (self._centres_mm - centre) @ rotation
         normals = self._normals @ rotation
-        total = np.zeros(len(points_mm))
         for guide, guide_mm in enumerate(lamp.guides_mm):
             strength, to_light = lamp.arriving(guide, points_mm)
             strength = strength * np.maximum(dot(normals, to_light), 0)
             lit = np.flatnonzero(strength > 0)
             source_mm = centre + rotation @ np.asarray(guide_mm)
             lit = lit[self._wall.sees(source_mm, self._centres_mm[lit])]
-            total[lit] += strength[lit]
-        return self._mean(total[:, None])[:, 0].astype(np.float32)
-
-    def bounce(self, direct: np.ndarray, albedo: np.ndarray) -> Bounce:
-        """All light between patches [P] of ``albedo`` [P, 3] for direct irradiance [P, F]."""
-        albedo = albedo[:, None].astype(np.float32)
-        source = albedo * direct[..., None]
-        arriving = np.zeros_like(source)
-        for _ in range(MOST_BOUNCES):
-            leaving = source + albedo * arriving
-            before = arriving
-            arriving = (self.form_factors @ leaving.reshape(len(direct), -1)).reshape(source.shape)
-            if np.abs(arriving - before).max() <= CONVERGED * arriving.max():
-                break
-        return Bounce(*(np.moveaxis(x, 1, 0).reshape(-1, *self.shape, 3) for x in (arriving, leaving)))
+            yield lit, strength[lit], to_light[lit] @ rotation.T
 
     def _of_blocks(self) -> np.ndarray:
         """Triangles int [P, 2·BLOCK²] of each patch."""
@@ -133,16 +169,8 @@ class Radiosity:
 
 
 def cosine_weighted(normals: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """Directions [N, 3] about unit normals with density cosθ/π for u, v in [0, 1): Malley's method, in the
-    basis of Duff et al. 2017."""
-    radius, angle = np.sqrt(u), 2 * np.pi * v
-    x, y, z = radius * np.cos(angle), radius * np.sin(angle), np.sqrt(1 - u)
-    sign = np.where(normals[:, 2] < 0, -1, 1)
-    a = -1 / (sign + normals[:, 2])
-    b = normals[:, 0] * normals[:, 1] * a
-    first = np.stack([1 + sign * normals[:, 0] ** 2 * a, sign * b, -sign * normals[:, 0]], axis=1)
-    second = np.stack([b, sign + normals[:, 1] ** 2 * a, -normals[:, 1]], axis=1)
-    return x[:, None] * first + y[:, None] * second + z[:, None] * normals
+    """Directions [N, 3] about unit normals with density cosθ/π for u, v in [0, 1): Malley's method."""
+    return about(normals, np.sqrt(1 - u), v)
 
 
 def inside(corners: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:

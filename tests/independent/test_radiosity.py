@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from independent.gloss import Gloss
 from independent.light import Lamp
 from independent.radiosity import Radiosity
 from independent.shapes import sphere
@@ -14,7 +15,8 @@ def test_a_sphere_is_an_integrating_sphere(albedo: float) -> None:
     wall = sphere(12)
     radiosity = Radiosity(wall, np.full((*wall.shape, 3), albedo), np.random.default_rng(0))
     direct = radiosity.direct(Lamp(L0=700, n=1.5, q=2), np.eye(4))[:, None]
-    indirect = radiosity.bounce(direct, radiosity.tissue).arriving[..., 0]
+    nothing = np.zeros_like(direct)
+    indirect = radiosity.bounce(direct, radiosity.tissue, nothing[:, 0], nothing).arriving[..., 0]
     share = np.sqrt((wall.doubled_area**2).sum(axis=1))
     mean = (share * direct[radiosity.patch_of, 0]).sum() / share.sum()
     assert indirect.mean() == pytest.approx(albedo / (1 - albedo) * mean, rel=0.01)
@@ -34,3 +36,25 @@ def test_a_lamp_at_the_centre_lights_half_a_sphere_evenly() -> None:
     direct = radiosity.direct(Lamp(L0=100, n=0, q=2), np.eye(4)).reshape(radiosity.shape)
     np.testing.assert_allclose(direct[4:], 1, rtol=0.01)
     assert not direct[:4].any()
+
+
+def test_what_facets_throw_on_is_the_light_times_their_directional_albedo() -> None:
+    """From the centre all light of a sphere comes head on; none of what is mirrored is lost."""
+    wall, roughness = sphere(12), 0.45
+    radiosity = Radiosity(wall, np.ones((*wall.shape, 3)), np.random.default_rng(0))
+    lamp, rough = Lamp(L0=700, n=1.5, q=2), np.full(len(radiosity.tissue), roughness)
+    thrown = radiosity.mirrored(lamp, np.eye(4), rough, 0.04, np.random.default_rng(1)) @ radiosity.area_mm2
+    arrived = radiosity.direct(lamp, np.eye(4)) @ radiosity.area_mm2
+    share = Gloss(0.04).at(np.ones(1), np.full(1, roughness))[0]
+    assert thrown == pytest.approx(share * arrived, rel=0.01)
+
+
+def test_smooth_facets_throw_light_from_a_spheres_centre_across_it() -> None:
+    wall, f0 = sphere(12), 0.04
+    radiosity = Radiosity(wall, np.ones((*wall.shape, 3)), np.random.default_rng(0))
+    lamp, smooth = Lamp(L0=700, n=4, q=2), np.full(len(radiosity.tissue), 0.1)
+    found = radiosity.mirrored(lamp, np.eye(4), smooth, f0, np.random.default_rng(1)).reshape(radiosity.shape)
+    direct = radiosity.direct(lamp, np.eye(4)).reshape(radiosity.shape)
+    across = np.roll(direct[::-1], radiosity.shape[1] // 2, axis=1)
+    np.testing.assert_allclose(found[:3].mean(axis=1), f0 * across[:3].mean(axis=1), rtol=0.1)
+    assert found[5:].max() < 0.01 * found[:2].min()

@@ -118,6 +118,19 @@ def unit(vectors: np.ndarray) -> np.ndarray:
     return vectors / np.maximum(np.sqrt((vectors * vectors).sum(axis=-1, keepdims=True)), 1e-20)
 
 
+def about(normals: np.ndarray, cos: np.ndarray, turn: np.ndarray) -> np.ndarray:
+    """Directions [N, 3] at angles of cosine ``cos`` [N] to unit normals, ``turn`` [N] of 1 around them,
+    in the basis of Duff et al. 2017."""
+    radius, angle = np.sqrt(1 - cos * cos), 2 * np.pi * turn
+    x, y = radius * np.cos(angle), radius * np.sin(angle)
+    sign = np.where(normals[:, 2] < 0, -1, 1)
+    a = -1 / (sign + normals[:, 2])
+    b = normals[:, 0] * normals[:, 1] * a
+    first = np.stack([1 + sign * normals[:, 0] ** 2 * a, sign * b, -sign * normals[:, 0]], axis=1)
+    second = np.stack([b, sign + normals[:, 1] ** 2 * a, -normals[:, 1]], axis=1)
+    return x[:, None] * first + y[:, None] * second + cos[:, None] * normals
+
+
 def sampled(image: np.ndarray, place: np.ndarray) -> np.ndarray:
     """Values [N, C] of an image [H, W, C] at (row, column) [N, 2], bilinear; columns wrap, rows end."""
     height, width = image.shape[:2]
