@@ -194,7 +194,7 @@ def test_photos_that_show_nothing_of_the_surface_are_an_error(tube, tmp_path):
     [
         ({"config": FitConfig(method="nerf")}, "unknown method 'nerf'.*twin, endopbr"),
         ({"epochs": 3}, "epochs belong to the method endopbr"),
-        ({"effects": {"noise": "on"}}, "rendered and not fitted.*synth --effects noise=on"),
+        ({"effects": {"noise": "on"}}, "cannot be forced on in a fit.*synth --effects noise=on"),
         ({"config": FitConfig(method="endopbr"), "effects": {"gain": "on"}}, "belong to the method twin"),
     ],
 )

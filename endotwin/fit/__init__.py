@@ -40,8 +40,8 @@ def fit(
         device: cpu, cuda, or auto for a GPU where there is one.
 
     Raises:
-        OptionError: an unknown method, an option that the method does not have, or an effect that is only
-            rendered.
+        OptionError: an unknown method, an option that the method does not have, or an effect that no fit can
+            be told to find.
         SequenceError: the photos cannot be read, or show nothing of the surface.
     """
     if config.method not in METHODS:
@@ -50,7 +50,7 @@ def fit(
     rendered = [name for name, state in (effects or {}).items() if name in RENDERED and state == "on"]
     if rendered:
         raise OptionError(
-            f"{rendered[0]} is rendered and not fitted; ask for it with 'synth --effects {rendered[0]}=on'"
+            f"{rendered[0]} cannot be forced on in a fit; ask for it with 'synth --effects {rendered[0]}=on'"
         )
     if config.method == "twin":
         if epochs is not None:

@@ -7,6 +7,7 @@ n and q and of how bright the tissue is.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import scipy.sparse
@@ -65,7 +66,7 @@ class Places:
     """Points at which bounced light is wanted.
 
     Attributes:
-        weights: CSR [N, P], interpolation from patches, as many to each point (``Radiosity.to_points``).
+        weights: CSR [N, P], interpolation from patches (``Radiosity.to_points``).
         view: int [N], in which view each point is seen.
     """
 
@@ -76,12 +77,18 @@ class Places:
         """Values [P, M, C] of patches in M views at the points, [N, C]."""
         if per_patch.shape[1] == 1:
             return self.weights @ per_patch[:, 0]
-        nearest = self.weights.indices.reshape(len(self.view), -1)
-        weight = self.weights.data.reshape(len(self.view), -1)
-        total = np.zeros((len(self.view), per_patch.shape[2]), np.float32)
-        for k in range(nearest.shape[1]):
-            total += weight[:, k, None] * per_patch[nearest[:, k], self.view]
-        return total
+        by_view = np.swapaxes(per_patch, 0, 1).reshape(-1, per_patch.shape[2])
+        return self._from_views @ by_view[: self._from_views.shape[1]]
+
+    @cached_property
+    def _from_views(self) -> scipy.sparse.csr_array:
+        """CSR [N, M·P], from patches in each view, for M views that see any."""
+        weights, patches = self.weights, self.weights.shape[1]
+        view = np.repeat(self.view.astype(np.int32), np.diff(weights.indptr))
+        shape = (len(self.view), (int(self.view.max(initial=0)) + 1) * patches)
+        return scipy.sparse.csr_array(
+            (weights.data, patches * view + weights.indices, weights.indptr), shape=shape
+        )
 
 
 @dataclass(frozen=True)

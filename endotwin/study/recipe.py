@@ -9,6 +9,9 @@ import yaml
 
 TRANSLATION_MM, ROTATION_DEG = 5, 8
 
+OTHER_LENSES = 1 / 3
+"""Share of frames that are rendered through other lenses than the twin's own, where a recipe asks for any."""
+
 
 @dataclass(frozen=True)
 class Recipe:
@@ -83,7 +86,7 @@ def merged(name: str, recipes: tuple[Recipe, ...]) -> Recipe:
 
 RENDERED = Recipe(
     "rendered",
-    "novel poses, through the lenses of the test sequences too, with the black around their circles",
+    "novel poses, a third through the lenses of the test sequences, with the black around their circles",
     lenses=True,
 )
 """What stands for endotwin's datasets: what helped (docs/study.md)."""

@@ -37,7 +37,7 @@ from endotwin.study.arms import HEADLINE, Arm, arms
 from endotwin.study.frames import Frames, kept, lit_pixels, of_dataset, of_sequence, require_depth
 from endotwin.study.leak import require_unseen
 from endotwin.study.networks import found, network
-from endotwin.study.recipe import ROTATION_DEG, TRANSLATION_MM, Recipe
+from endotwin.study.recipe import OTHER_LENSES, ROTATION_DEG, TRANSLATION_MM, Recipe
 from endotwin.study.train import LOSSES, Course, train
 from endotwin.tradeoff.run import PARTIAL, machine
 from endotwin.twin import Twin
@@ -217,12 +217,14 @@ class _Experiment:
         return self._pools[name]
 
     def _rendered(self, recipe: Recipe) -> Frames:
-        """The frames of a recipe: evenly from all twins, through each lens."""
-        shares = [(twin, *lens) for twin in self.twins.values() for lens in self._lenses(twin, recipe)]
+        """The frames of a recipe: evenly from all twins, through each lens its share."""
+        lenses = [(twin, *lens) for twin in self.twins.values() for lens in self._lenses(twin, recipe)]
+        shares = np.cumsum([share for *_, share in lenses])
+        counts = np.diff(np.rint(self.plan.frames * shares / shares[-1]).astype(int), prepend=0).tolist()
         recipe.write(self.work / "recipes" / f"{recipe.name}.yaml")
         parts, count = [], 0
-        for number, (twin, lens, lit) in enumerate(shares):
-            if wanted := len(range(number, self.plan.frames, len(shares))):
+        for number, ((twin, lens, lit, _), wanted) in enumerate(zip(lenses, counts, strict=True)):
+            if wanted:
                 data = self._dataset(recipe, f"{recipe.name}-{number}", twin, lens, wanted)
                 parts.append(of_dataset(data, self.size, lit, recipe.codec))
                 count += _read(data / DATASET)["frames"]
@@ -246,9 +248,9 @@ class _Experiment:
             )
         return data
 
-    def _lenses(self, twin: Twin, recipe: Recipe) -> list[tuple[Camera, np.ndarray]]:
-        """The twin's own lens, and where the recipe says so those of the tests, each once: the camera, and
-        which pixels are not black around its circle."""
+    def _lenses(self, twin: Twin, recipe: Recipe) -> list[tuple[Camera, np.ndarray, float]]:
+        """The twin's own lens, and where the recipe says so those of the tests, each once: the camera, which
+        pixels are not black around its circle, and the share of frames that are seen through it."""
         width = SUPERSAMPLING * self.size[0]
         found = {}
         for sequence in (twin.sequence(), *(self.tests if recipe.lenses else ())):
@@ -256,7 +258,9 @@ class _Experiment:
             key = json.dumps(camera.to_dict())
             if key not in found:
                 found[key] = camera, lit_pixels(sequence, self.size)
-        return list(found.values())
+        others = len(found) - 1
+        shares = [1 - OTHER_LENSES, *others * [OTHER_LENSES / others]] if others else [1.0]
+        return [(*lens, share) for lens, share in zip(found.values(), shares, strict=True)]
 
     # Training and judging
 
