@@ -39,8 +39,8 @@ CELL_MM, COARSEST_MM = 1.6, 12.0
 PROXIES = 4
 """Vertices are merged to so many points a finest cell."""
 
-STEPS, BOUNCE_STEPS = 6, 10
-"""Steps, and those where light bounces."""
+STEPS, BOUNCE_STEPS = 6, 16
+"""Steps at most, and those where light bounces."""
 
 HOLD_STEPS = 1
 """Before these the scale of the albedo, which tells how light bounces, is held."""
