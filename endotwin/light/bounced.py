@@ -148,15 +148,19 @@ class BouncedLight:
             for pose in T_local_camera
         ]
         middle_mm = np.mean(np.asarray(guides_mm), axis=0)
-        self._mirrors = [
-            radiosity.mirror_factors(pose[:3, 3] + pose[:3, :3] @ middle_mm, lamps)
-            for pose, lamps in zip(T_local_camera, self._lamps, strict=True)
-        ]
+        self._sources_mm = T_local_camera[:, :3, 3] + T_local_camera[:, :3, :3] @ middle_mm
 
     def at(self, places: Places, n: float, q: float, albedo: Albedo) -> np.ndarray:
         """Irradiance float32 [N, 3] with L0 = 1 and patches of ``albedo``."""
         direct = np.stack([self._radiosity.direct(lamps, n, q).mean(axis=1) for lamps in self._lamps], axis=1)
-        return places.of(self._radiosity.indirect(direct, albedo.base_color, albedo.glossy, self._mirrors))
+        mirrors = self._mirrors if albedo.glossy.any() else ()
+        return places.of(self._radiosity.indirect(direct, albedo.base_color, albedo.glossy, mirrors))
+
+    @cached_property
+    def _mirrors(self) -> list[scipy.sparse.csr_array]:
+        """What each view's light throws on where white lobes mirror it."""
+        views = zip(self._sources_mm, self._lamps, strict=True)
+        return [self._radiosity.mirror_factors(source_mm, lamps) for source_mm, lamps in views]
 
     def expanded(
         self,

@@ -34,11 +34,11 @@ from endotwin.surface.vectors import dot, unit
 RAYS = 256
 """Rays of a patch that count its form factors: one part in 16 of noise, and half of that after a bounce."""
 
-FACETS = 16
-"""Of each such point that is lit, in which it mirrors light."""
-
 POINTS = 4
 """Points of a patch at which direct light is evaluated."""
+
+FACETS = 16
+"""Of each such point that is lit, in which it mirrors light."""
 
 NEIGHBOURS = 4
 """Patches between which a vertex interpolates."""
