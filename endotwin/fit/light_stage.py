@@ -39,7 +39,7 @@ CELL_MM, COARSEST_MM = 1.6, 12.0
 PROXIES = 4
 """Vertices are merged to so many points a finest cell."""
 
-STEPS, BOUNCE_STEPS = 6, 16
+STEPS, BOUNCE_STEPS = 6, 10
 """Steps at most, and those where light bounces."""
 
 HOLD_STEPS = 1
