@@ -39,6 +39,21 @@ def sphere() -> tuple[BouncedLight, Places, Albedo]:
     return light, Places(radiosity.to_vertex, np.arange(count) % 2), albedo
 
 
+def series(albedo: float) -> float:
+    """E/E_direct = (ρ + ρ² + …)/2 of a light that faces half the sphere (Ulbricht's integrating sphere)."""
+    return albedo / (1 - albedo) / 2
+
+
+@pytest.mark.parametrize("log_scale", [0.0, 0.3])
+def test_what_is_sent_back_evenly_reaches_each_place_alike(sphere, log_scale):
+    light, places, albedo = sphere
+    dull = Albedo(albedo.scaled(log_scale).base_color + albedo.glossy, 0 * albedo.glossy)
+    expected = series(BASE_COLOR * np.exp(log_scale) + GLOSSY) / RADIUS_MM**2
+    bounced = light.at(places, n=0.0, q=2.0, albedo=dull)
+    np.testing.assert_allclose(bounced, expected, rtol=0.05)
+    assert bounced.mean() == pytest.approx(expected, rel=0.01)
+
+
 @pytest.mark.parametrize("log_scale", [0.0, 0.3])
 def test_base_color_sends_light_back_evenly_and_gloss_head_on_light_across(sphere, log_scale):
     """Both in the same amount as ever after; at first lobes send their share of head-on light back."""

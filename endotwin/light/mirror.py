@@ -15,7 +15,7 @@ import torch
 from endotwin.light import shading
 from endotwin.light.forward import Lobes
 from endotwin.light.incidence import COS_MIN
-from endotwin.surface.vectors import dot, unit
+from endotwin.surface.vectors import dot, frame_along, unit
 
 TURN = (math.sqrt(5) - 1) / 2
 """From facet to facet about the normal, of a full turn: the golden angle."""
@@ -55,8 +55,7 @@ def _facets(
     number = np.arange(facets, dtype=np.float32)
     u = np.minimum((number + draw[:, :1]) / facets, HIGHEST)
     slope, turn = alpha * np.sqrt(u / (1 - u)), 2 * math.pi * (TURN * number + draw[:, 1:])
-    side = unit(np.cross(normals, np.eye(3, dtype=np.float32)[np.abs(normals).argmin(axis=1)]))
-    other = np.cross(normals, side)
-    aside = np.cos(turn)[..., None] * side[:, None] + np.sin(turn)[..., None] * other[:, None]
+    side, other, _ = np.moveaxis(frame_along(normals)[:, None], 2, 0)
+    aside = np.cos(turn)[..., None] * side + np.sin(turn)[..., None] * other
     facet = unit((normals[:, None] + slope[..., None] * aside).reshape(-1, 3))
     return facet.astype(np.float32), slope.ravel().astype(np.float32)

@@ -205,13 +205,13 @@ class Radiosity:
         points_mm, normals = self._points_mm[lit], self._normals[lit]
         to_light = unit(source_mm.astype(np.float32) - points_mm)
         direction, thrown = mirrored(normals, to_light, self._facets[lit], FACETS)
-        point, patch = (np.repeat(x, FACETS) for x in (np.arange(len(lit)), lit // POINTS))
         sent = np.flatnonzero(thrown)
-        origin_mm = (points_mm + self._lift_mm * normals)[point[sent]]
+        origin_mm = (points_mm + self._lift_mm * normals)[sent // FACETS]
         landed, met = self._landed(origin_mm, direction[sent])
         sent = sent[landed]
-        patch, share = patch[sent], share[lit][point[sent]]
-        thrown = thrown[sent] * share * self._area_mm2[patch] / self._area_mm2[met]
+        point = lit[sent // FACETS]
+        patch = point // POINTS
+        thrown = thrown[sent] * share[point] * self._area_mm2[patch] / self._area_mm2[met]
         return self._matrix(thrown.astype(np.float32), met, patch)
 
     def indirect(

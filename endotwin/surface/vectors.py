@@ -36,9 +36,9 @@ def unit(vectors: np.ndarray) -> np.ndarray:
 
 
 def frame_along(axis: np.ndarray) -> np.ndarray:
-    """Rows [3, 3] of a right-handed frame with the third along the unit vector ``axis`` [3]."""
-    side = unit(np.cross(axis, np.eye(3)[np.abs(axis).argmin()]))
-    return np.stack([side, np.cross(axis, side), axis])
+    """Rows [..., 3, 3] of right-handed frames with the third along unit vectors ``axis`` [..., 3]."""
+    side = unit(np.cross(axis, np.eye(3, dtype=axis.dtype)[np.abs(axis).argmin(axis=-1)]))
+    return np.stack([side, np.cross(axis, side), axis], axis=-2)
 
 
 def turned_along(vectors: np.ndarray, one: np.ndarray, other: np.ndarray) -> np.ndarray:

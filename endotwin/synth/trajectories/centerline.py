@@ -20,7 +20,7 @@ from scipy.spatial import cKDTree
 
 from endotwin.errors import TrajectoryError
 from endotwin.surface import Surface
-from endotwin.surface.vectors import unit
+from endotwin.surface.vectors import frame_along, unit
 from endotwin.synth.trajectories.lumen import Lumen
 
 CHORDS = 4000
@@ -231,9 +231,7 @@ def _angles() -> np.ndarray:
 
 def _spokes(tangents: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Directions [N, SPOKES, 3] across unit tangents [N, 3], and the axes u, v [N, 3] that they turn in."""
-    helper = np.eye(3)[np.abs(tangents).argmin(axis=1)]
-    u = unit(np.cross(tangents, helper))
-    v = np.cross(tangents, u)
+    u, v, _ = np.moveaxis(frame_along(tangents), 1, 0)
     angles = _angles()[None, :, None]
     return np.cos(angles) * u[:, None] + np.sin(angles) * v[:, None], u, v
 
