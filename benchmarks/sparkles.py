@@ -33,7 +33,7 @@ def main() -> None:
             view = renderer.view(frame.T_world_camera, sequence.lens_mask)
             valid = view.mask & np.isfinite(frame.depth_mm)
             if name == "film":
-                gain = gain_of(photo[valid], view.radiance[valid], twin.response.gamma)
+                gain = gain_of(twin.untoned(photo[valid]), view.radiance[valid], twin.response.gamma)
                 areas["photo"].append(log_areas(highlights(photo, valid)))
             view = renderer.view(frame.T_world_camera, sequence.lens_mask, gain)
             areas[name].append(log_areas(highlights(view.color, valid)))

@@ -15,6 +15,7 @@ from endotwin.effects import Effects
 from endotwin.effects.coat import Coat
 from endotwin.effects.offset import Offset
 from endotwin.effects.profile import Profile
+from endotwin.effects.tone import Tone
 from endotwin.effects.vignetting import Vignetting
 from endotwin.evaluation.metrics import psnr
 from endotwin.export import export
@@ -59,8 +60,8 @@ def test_a_page_needs_nothing_but_itself(twin, tmp_path):
 @pytest.mark.skipif(BROWSER is None, reason="there is no Chromium")
 @pytest.mark.parametrize(
     "effects",
-    [(), (Offset(GUIDES), Coat(2.0, 0.15)), (Vignetting(-0.4, 0.1), Profile(1.0))],
-    ids=["plain", "guides and coat", "vignetting and profile"],
+    [(), (Offset(GUIDES), Coat(2.0, 0.15)), (Vignetting(-0.4, 0.1), Profile(1.0), Tone(0.4))],
+    ids=["plain", "guides and coat", "vignetting, profile and tone"],
 )
 def test_a_browser_shows_what_the_twin_shows_at_the_lens(twin, tmp_path, effects):
     twin = replace(twin, effects=Effects(effects))

@@ -8,6 +8,7 @@ import test_model
 import torch
 
 from endotwin.effects.coat import Coat
+from endotwin.effects.tone import Tone
 from endotwin.fit.model import linearise
 from endotwin.light import forward, shading
 from endotwin.light.forward import Lit, Lobes
@@ -60,10 +61,12 @@ def test_exposure_scales_all_light():
 
 @pytest.mark.parametrize("scene", test_model.SCENES)
 @pytest.mark.parametrize("coat", [None, Coat(0.6, 0.2), Coat(0.6, 0.2, tail=1.0)])
-def test_the_derivatives_of_least_squares_are_those_of_automatic_differentiation(scene, coat):
+@pytest.mark.parametrize("tone", [None, Tone(0.4)])
+def test_the_derivatives_of_least_squares_are_those_of_automatic_differentiation(scene, coat, tone):
     """By base colour, roughness, coat and, at the displayed colour b^γ, by γ·ln L0, γn, γq, γ and ln f0."""
     samples = test_model.SCENES[scene](test_model.made_samples(40, 17))
     material, shared = test_model.made_materials(40), replace(test_model.shared_of(scene), coat=coat)
+    shared = replace(shared, tone=tone)
     model = linearise(samples, material, shared)
     shown = material[:, :3] ** shared.gamma
 
@@ -79,7 +82,8 @@ def test_the_derivatives_of_least_squares_are_those_of_automatic_differentiation
             followed = samples.bounce.followed(torch.log(color), vector[3])
             lit = replace(lit, irradiance=lit.irradiance * followed)
         x = forward.radiance(lit, (log_L0, n, q), color, roughness, lobes)
-        return shading.respond(x, vector[3])
+        untoned = shading.respond(x, vector[3])
+        return untoned if tone is None else tone.shown(untoned)
 
     weight = torch.tensor(0.0 if coat is None else coat.weight, dtype=torch.float64)
     by_vector, by_roughness, by_weight = torch.autograd.functional.jacobian(

@@ -14,6 +14,7 @@ from endotwin.effects.offset import Offset
 from endotwin.effects.profile import Profile
 from endotwin.effects.shadows import Shadows
 from endotwin.effects.specular import Specular
+from endotwin.effects.tone import Tone
 from endotwin.effects.vignetting import Vignetting
 from endotwin.fit.gauss_newton import GaussNewton
 from endotwin.fit.lighting import Relighting, lit
@@ -31,6 +32,7 @@ SCENES = {
     "offset and shadows": [GUIDES, Shadows()],
     "interreflection": [Interreflection(4.0)],
     "coat": [Coat(0.8, 0.15)],
+    "tone": [Tone(0.3)],
     "all": [
         GUIDES,
         Shadows(),
@@ -39,6 +41,7 @@ SCENES = {
         Vignetting(-0.5, -0.1),
         Profile(0.7),
         Coat(0.8, 0.15),
+        Tone(0.3),
     ],
 }
 POSES = np.stack([tube_twin.pose(0.3), tube_twin.pose(0.6)])
@@ -58,7 +61,7 @@ def test_the_renderers_pixels_are_what_the_fit_predicts(tube, scene):
     twin, caster = replace(tube, effects=effects), Caster(tube.surface)
     samples, state = tube_twin.photographed(tube, tube.camera, POSES), tube_twin.state_of(tube)
     shared = Globals.of(twin.light, twin.response, twin.materials.f0, bounce=bool(effects.bounce))
-    state = replace(state, shared=replace(shared, coat=effects.get("coat")))
+    state = replace(state, shared=replace(shared, coat=effects.get("coat"), tone=effects.get("tone")))
     # The fit would find its own gains again, of photos without one.
     relighting = Relighting(tube.surface, caster, effects.without(["gain"]), samples.views)
     solver = GaussNewton(lit(samples, tube.surface, caster, effects), tube.surface.triangles, state.operator)

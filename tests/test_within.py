@@ -9,12 +9,16 @@ import torch
 
 from endotwin.effects import Decision
 from endotwin.effects.coat import Coat
+from endotwin.effects.tone import Tone
 from endotwin.evidence.coat import judged
+from endotwin.evidence.tone import judged as judged_tone
+from endotwin.evidence.tone import steadied
 from endotwin.fit.gauss_newton import ROUGHNESS_RANGE, roughness_to_raw
 from endotwin.fit.model import Globals, predict
 from endotwin.fit.within import Varied, Within
 from endotwin.light.bounced import Bounce
 from endotwin.pixels.samples import Samples, Views
+from endotwin.pixels.start import DIFFUSE_SIN2
 from endotwin.twin import Light, Response
 
 VERTICES, SIGHTINGS = 600, 40
@@ -80,6 +84,43 @@ def test_a_coat_is_found_with_its_roughness_tail_and_weight(tail):
         shared = within.renewed(material, shared, (), NOISE).shared
     assert shared.coat.weight == pytest.approx(0.8, rel=0.05)
     assert told(shared) == pytest.approx(told(TRUE), rel=0.02)
+
+
+def coloured(within: Within, material: torch.Tensor, shared: Globals) -> torch.Tensor:
+    """The materials with base colours under which each vertex is as bright as its photos, in the mean."""
+    shown = within.samples.color.double() / 255
+    if shared.tone is not None:
+        shown = torch.from_numpy(shared.tone.undone(shown.numpy()))
+    brighter = torch.log(shown) - torch.log(predict(within.samples, material, replace(shared, tone=None)))
+    dull = ((within.samples.sin2 > DIFFUSE_SIN2)[:, None] * (shown < 1)).double()
+    mean = torch.zeros(VERTICES, 3, dtype=torch.float64), torch.from_numpy(within.vertex)
+    brighter = mean[0].index_add(0, mean[1], dull * brighter) / mean[0].index_add(0, mean[1], dull)
+    colors = material[:, :3] * (brighter / shared.gamma).exp()[within.vertex]
+    return torch.cat([colors, material[:, 3:]], dim=1)
+
+
+@pytest.mark.parametrize("contrast", [-0.3, 0.3])
+def test_a_tone_curve_is_found_with_light_and_response_that_begin_elsewhere(contrast):
+    within, material = photographed(replace(TRUE, tone=Tone(contrast)))
+    shared = Globals.of(Light(120.0, 2.2, 2.0), Response(0.5), f0=0.045)
+    material = coloured(within, material, shared)
+    tone, decision = judged_tone(within.hues(material, shared, NOISE), "auto")
+    assert decision.state == "on" and tone.contrast == pytest.approx(contrast, abs=0.05)
+    shared = replace(shared, tone=tone)
+    for _ in range(8):
+        material = coloured(within, material, shared)
+        shared = within.renewed(material, shared, (), NOISE).shared
+        shared = replace(shared, tone=steadied(shared.tone, within.hues(material, shared, NOISE)))
+    assert shared.tone.contrast == pytest.approx(contrast, abs=0.03)
+    assert told(shared)[:3] == pytest.approx(told(TRUE)[:3], rel=0.03)
+
+
+def test_photos_without_a_tone_curve_get_none_whatever_the_light():
+    within, material = photographed()
+    for light, gamma in ((Light(120.0, 2.2, 2.0), 0.5), (Light(120.0, 1.0, 2.6), 0.35)):
+        shared = Globals.of(light, Response(gamma), f0=0.035)
+        seen = within.hues(coloured(within, material, shared), shared, NOISE)
+        assert judged_tone(seen, "auto")[0] is None
 
 
 def test_tissue_without_a_coat_gets_none_and_one_that_is_forced_on_weighs_nothing():

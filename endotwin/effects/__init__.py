@@ -15,7 +15,7 @@ from endotwin.errors import OptionError
 
 FITTED = (
     *("specular", "offset", "shadows", "interreflection", "gain", "vignetting", "profile"),
-    *("coat", "film", "sparkle"),
+    *("coat", "film", "sparkle", "tone"),
 )
 RENDERED = (
     *("auto_gain", "noise", "motion_blur", "defocus", "rolling_shutter", "interlacing", "chromatic"),

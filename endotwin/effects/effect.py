@@ -7,7 +7,7 @@ on its way in this order:
 - how tissue answers it (specular, coat, film, sparkle);
 - when pixels see it (motion blur, rolling shutter, interlacing);
 - what the lens makes of the radiance image (vignetting, defocus, chromatic, bloom, lens);
-- what the sensor makes of that (gain, auto_gain, noise);
+- what the sensor makes of that (gain, auto_gain, tone, noise);
 - what becomes of the picture afterwards (processor, overlay, chroma, codec, video).
 """
 

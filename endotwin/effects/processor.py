@@ -7,17 +7,19 @@ from typing import ClassVar
 
 import cv2
 import numpy as np
+import torch
 
 from endotwin.effects import rim
 from endotwin.effects.effect import Effect, parameter
 from endotwin.effects.luma import LUMA
+from endotwin.effects.tone import Tone
 from endotwin.sequence import Sequence
 
 
 @dataclass(frozen=True)
 class Processor(Effect):
-    """An S-shaped tone curve of display values, C' = C + contrast·(3C² − 2C³ − C), then an unsharp mask of
-    their luminance Y, C'' = C' + sharpening·(Y − G ∗ Y) with a Gaussian G; clipped to [0, 1].
+    """A tone curve (``Tone``) of display values, then an unsharp mask of their luminance Y, C'' = C' +
+    sharpening·(Y − G ∗ Y) with a Gaussian G; clipped to [0, 1].
 
     Attributes:
         contrast: of the curve, which leaves 0, ½ and 1 in their places. sharpening: of the luminance.
@@ -31,14 +33,14 @@ class Processor(Effect):
 
     def recorded(self, color: np.ndarray) -> np.ndarray:
         """Display values float32 [H, W, 3] as the processor gives them out."""
-        toned = color + np.float32(self.contrast) * (color**2 * (3 - 2 * color) - color)
+        toned = Tone(self.contrast).shown(torch.from_numpy(color)).numpy()
         luma = toned @ LUMA
         detail = luma - cv2.GaussianBlur(luma, (0, 0), self.radius, borderType=cv2.BORDER_REFLECT)
         return np.clip(toned + np.float32(self.sharpening) * detail[..., None], 0, 1)
 
     @classmethod
     def evidence(cls, sequence: Sequence) -> tuple[Processor | None, str]:
-        """Sharpening where the edge of the lens circle overshoots; of a tone curve nothing is told."""
+        """Sharpening where the edge of the lens circle overshoots; a tone curve is for a fit to tell."""
         found = rim.unsharp(sequence)
         if found is None:
             return None, (

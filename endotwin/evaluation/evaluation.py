@@ -206,7 +206,7 @@ def covered_pixels(hits: Correspondences, surface: Surface, shape: tuple[int, in
 
 
 def gain_of(photo: np.ndarray, radiance: np.ndarray, gamma: float) -> float:
-    """Factor on ``radiance`` [..., 3] that makes it look like ``photo`` (display-encoded, of its shape).
+    """Factor on ``radiance`` [..., 3] that makes it look like ``photo`` (x^γ, of its shape).
 
     The median of their ratio over mid-tones, which highlights and shadows' edges do not move; 1 where there
     are none.
@@ -263,13 +263,13 @@ def _shown_by_twin(twin: Twin, sequence: Sequence) -> Show:
     def show(frame: Frame, photo: np.ndarray, valid: np.ndarray) -> tuple[np.ndarray, float, np.ndarray]:
         view, gain = renderer.view(frame.T_world_camera, sequence.lens_mask), 1.0
         if "gain" in twin.effects:
-            gain = gain_of(photo[valid], view.radiance[valid], twin.response.gamma)
+            gain = gain_of(twin.untoned(photo[valid]), view.radiance[valid], twin.response.gamma)
             view = renderer.view(frame.T_world_camera, sequence.lens_mask, gain)
         color = view.color
         if "bloom" in twin.effects:
             radiance = torch.from_numpy(view.radiance)
             glared = twin.effects["bloom"].through(radiance, view.depth_mm, sequence.camera)
-            color = shading.respond(glared, twin.response.gamma).clamp(0, 1).numpy()
+            color = twin.displayed(glared).clamp(0, 1).numpy()
         return color, gain, valid & covered_pixels(view.hits, twin.surface, valid.shape)
 
     return show

@@ -31,7 +31,7 @@ class Appearance:
         L0, n, q: L0·cosⁿθ/d^q, d in mm. profile: angular shape of the light, 0 for cosⁿθ (see
             ``guides.log_axis``). guides_mm: places of the light guides in the camera frame (OpenCV axes);
             together they have L0.
-        gamma: display value = x^gamma.
+        gamma, tone: display value D = C + tone·(3C² − 2C³ − C) of C = x^gamma.
         f0: specular reflectance at normal incidence. burley: whether the diffuse lobe is Burley's.
         coat_f0, coat_roughness, coat_tail: reflectance, times its weight, roughness and tail of the wet coat;
             a reflectance of 0: no coat.
@@ -47,6 +47,7 @@ class Appearance:
     profile: float
     guides_mm: tuple[tuple[float, float, float], ...]
     gamma: float
+    tone: float
     f0: float
     burley: bool
     coat_f0: float
@@ -72,6 +73,7 @@ class Appearance:
             profile=effects.profile,
             guides_mm=effects.guides_mm or AT_LENS,
             gamma=twin.response.gamma,
+            tone=effects["tone"].contrast if "tone" in effects else 0.0,
             f0=twin.materials.f0,
             burley=twin.materials.diffuse == "burley",
             coat_f0=coat.weight * shading.F0_WATER if coat else 0.0,
@@ -90,12 +92,19 @@ class Appearance:
         """I on the optical axis of all guides together, for lengths in mm and display white at 1."""
         return 2 * math.pi * self.L0 * self.usual_mm ** (2 - self.q)
 
+    @property
+    def displayed(self) -> str:
+        """What is displayed of radiance x, as a formula."""
+        power = f"x^{self.gamma:.6g}"
+        return f"C + {self.tone:.6g}*(3*C^2 - 2*C^3 - C) of C = {power}" if self.tone else power
+
     def to_dict(self) -> dict:
         """All of it as plain values, with what the names mean."""
         return {
             **asdict(self),
             "words": "x = 2*pi*L0*sum over guides(cos(theta)^n/d^q*(n.wi)*(diffuse + specular))/guides, "
-            "display = x^gamma; d in mm; guides_mm in the camera frame: x right, y down, z forward",
+            "C = x^gamma, display = C + tone*(3*C^2 - 2*C^3 - C); d in mm; guides_mm in the camera frame: "
+            "x right, y down, z forward",
         }
 
 

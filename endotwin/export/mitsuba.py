@@ -43,7 +43,7 @@ TO_OPENCV = {"x": "-1", "y": "-1"}
 """Mitsuba's cameras have x left and y up."""
 
 WORDS = """
-A twin of endotwin's. Lengths are mm; pixels are radiance, and the picture is clip(x, 0, 1)^{gamma:.6g}.
+A twin of endotwin's. Lengths are mm; pixels are radiance x, and the picture is {displayed}, clipped.
 Choose the pose of camera and light (camera to world, 16 numbers row by row; poses.txt has the recorded ones):
   mitsuba scene.xml -Dpose="..."    or    mitsuba.load_file("scene.xml", pose="...")
 """
@@ -175,7 +175,7 @@ def _mean(lobes: list[xml.Element]) -> xml.Element:
 
 def _scene(twin: Twin, look: Appearance, lobes: list[xml.Element], pose: np.ndarray, field: float) -> bytes:
     scene = xml.Element("scene", version="3.0.0")
-    scene.append(xml.Comment(WORDS.format(gamma=look.gamma)))
+    scene.append(xml.Comment(WORDS.format(displayed=look.displayed)))
     xml.SubElement(scene, "default", name="pose", value=matrix(pose))
     xml.SubElement(scene, "default", name="spp", value="64")
     integrator = xml.SubElement(scene, "integrator", type="path")

@@ -18,7 +18,7 @@ from endotwin.export.textured import Textured, textured
 from endotwin.run.output import write_with_parts
 from endotwin.twin import Twin
 
-MATERIAL = """# endotwin: light L0 {L0:.6g}, n {n:.6g}, q {q:.6g}; display = x^{gamma:.6g}; f0 {f0:.6g}
+MATERIAL = """# endotwin: light L0 {L0:.6g}, n {n:.6g}, q {q:.6g}; display = {displayed}; f0 {f0:.6g}
 newmtl tissue
 Kd 1 1 1
 Ks {f0:.6g} {f0:.6g} {f0:.6g}
@@ -43,7 +43,7 @@ def write_obj(twin: Twin, path: Path, overwrite: bool = False) -> None:
         "roughness": png(mesh.roughness),
         "normal": png(mesh.normal / 2 + 0.5),
     }
-    material = MATERIAL.format(stem="{stem}", **look.to_dict())
+    material = MATERIAL.format(stem="{stem}", displayed=look.displayed, **look.to_dict())
     checksum = hashlib.sha256(b"".join([material.encode(), *pictures.values()])).hexdigest()[:16]
     stem = f"{path.stem}-{checksum}"
     parts = {f"{stem}_{part}.png": picture for part, picture in pictures.items()}

@@ -204,8 +204,9 @@ class Based:
 
     @property
     def shown(self) -> Tensor:
-        """The photos' display values [N, 3]."""
-        return self.samples.color.float() / 255
+        """The photos' display values [N, 3], before a tone curve."""
+        shown, tone = self.samples.color.float() / 255, self.model.state.shared.tone
+        return shown if tone is None else torch.from_numpy(tone.undone(shown.numpy()))
 
     def predicted(self, film: Tensor | float = 0.0) -> Tensor:
         """Display values [N, 3] with the radiance [N, 1] of a ``film``."""

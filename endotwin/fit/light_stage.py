@@ -6,13 +6,17 @@ depends on the materials, so that both are found in one step; what varies has th
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 
 from endotwin.effects import Decision, Effects
+from endotwin.effects.tone import Tone
 from endotwin.evidence.coat import judged as judged_coat
+from endotwin.evidence.tone import Hues, steadied
+from endotwin.evidence.tone import judged as judged_tone
 from endotwin.fit.gauss_newton import (
     GaussNewton,
     State,
@@ -93,7 +97,8 @@ class LightStage:
 
     Args:
         samples: that tell the light. clipped: those that only say 'at least', to which a coat is held, too.
-        coat: whether there is one: auto, on or off.
+        start: where to start, with a tone curve taken off the photos. wanted: auto, on or off, of coat and
+            tone.
     """
 
     def __init__(
@@ -101,14 +106,15 @@ class LightStage:
         samples: Samples,
         clipped: Samples,
         surface: Surface,
-        start: Start,
+        start: Callable[[Tone | None], Start],
         pace: Pace,
         relighting: Relighting,
-        coat: str,
+        wanted: Mapping[str, str],
         device: torch.device,
     ):
-        self._clipped, self._surface, self._pace, self._coat = clipped, surface, pace, coat
-        self._relighting, self._undetermined = relighting, start.undetermined
+        self._clipped, self._surface, self._pace, self._wanted = clipped, surface, pace, wanted
+        self._relighting, self._start = relighting, start
+        self._decisions: dict[str, Decision] = {}
         self._unit_mm = unit_mm(surface)
         points, group = proxies(surface.vertices_mm, self._unit_mm * CELL_MM / PROXIES)
         began = pace.stopwatch.total
@@ -118,30 +124,45 @@ class LightStage:
         self._solver = GaussNewton(
             samples, triangles, operator, self._unit_mm, out_of_time=pace.light_is_over, device=device
         )
-        self._state = _started(operator, start, relighting)
-        relighting(self._solver, self._state)
-        self._judged: Decision | None = None
-        ready = pace.stopwatch.total
-        self._state, _ = self._stepped(self._state, joint=False)
+        self._operator = operator
+        ready = self._begin(None)
         step_s = pace.stopwatch.total - ready
         self._cost = Cost(ready - began, step_s, len(points) * len(operator.cells_mm), len(samples))
 
-    def found(self) -> tuple[State, Cost, Decision]:
-        """The state, what it cost, and whether there is a coat."""
-        if self._relighting.bounces:
-            self._in_one_step()
-        if not self._relighting.bounces:
-            self._in_turns()
-        return self._state, self._cost, self._judged or Decision("off", "no time to judge")
+    def found(self) -> tuple[State, Cost, dict[str, Decision]]:
+        """The state, what it cost, and whether there are a coat and a tone curve; where there is a curve,
+        light and materials are sought anew beside it."""
+        if (tone := self._search()) is not None:
+            self._begin(tone)
+            self._search()
+        hurried = Decision("off", "no time to judge")
+        return self._state, self._cost, dict.fromkeys(self._wanted, hurried) | self._decisions
 
-    def _in_turns(self) -> None:
+    def _begin(self, tone: Tone | None) -> float:
+        """Even tissue, and a step of the materials; the time when that step began, seconds."""
+        start = self._start(tone)
+        self._undetermined = start.undetermined
+        self._state = _started(self._operator, start, self._relighting, tone)
+        self._relighting(self._solver, self._state)
+        ready = self._pace.stopwatch.total
+        self._state, _ = self._stepped(self._state, joint=False)
+        return ready
+
+    def _search(self) -> Tone | None:
+        """Seek light and materials; a tone curve beside which to begin anew ends it early."""
+        tone = self._in_one_step() if self._relighting.bounces else None
+        return tone if self._relighting.bounces else self._in_turns()
+
+    def _in_turns(self) -> Tone | None:
         """Light by what varies within vertices, then the materials, then light again."""
         number = 0
         while number < STEPS:
             late = self._late
             if late and number:
                 break
-            shared = self._coated() if self._judges(number, COAT_STEP) else self._state.shared
+            if (tone := self._new_tone(number, COAT_STEP)) is not None:
+                return tone
+            shared = self._judged(number, COAT_STEP)
             within, material = self._within()
             found = within.renewed(material, shared, self._undetermined, self._noise, self._relighting.varied)
             self._relighting.vary(self._solver, found)
@@ -150,13 +171,16 @@ class LightStage:
                 break
             self._state, gain = self._stepped(self._state, joint=False)
             number = self._next(number, STEPS, gain, COAT_STEP)
+        return None
 
-    def _in_one_step(self) -> None:
+    def _in_one_step(self) -> Tone | None:
         """Light and materials in one step, for the strength of the bounce; then light by what varies. Ends
         early where photos show no bounce."""
         number, best = 0, None
         while number < BOUNCE_STEPS and not self._late:
-            shared = self._coated() if self._judges(number, BOUNCE_COAT_STEP) else self._state.shared
+            if (tone := self._new_tone(number, BOUNCE_COAT_STEP)) is not None:
+                return tone
+            shared = self._judged(number, BOUNCE_COAT_STEP)
             scale = ("albedo scale",) * (number < HOLD_STEPS)
             self._solver.held = (*self._undetermined, *BOUNCE_HELD, *scale)
             if shared.coat:
@@ -165,12 +189,13 @@ class LightStage:
             self._state, gain = self._stepped(self._state, joint=True)
             if too_dark(self._state):
                 self._state = self._relighting.without_bounce(self._solver, self._state)
-                return
+                return None
             if number >= BOUNCE_COAT_STEP:
                 best = self._better(best, self._state)
             number = self._next(number, BOUNCE_STEPS, gain, BOUNCE_COAT_STEP)
         if best is not None:
             self._take_best(self._by_what_varies(best))
+        return None
 
     def _by_what_varies(self, best: Best) -> Best:
         """Light and response by what varies within vertices, beside a bounce of the strength that was found,
@@ -223,10 +248,29 @@ class LightStage:
         self._pace.report("find the light", number + 1, steps)
         if abs(gain) >= CONVERGED * self._solver.cost(self._state, self._noise):
             return number + 1
-        return max(number + 1, coat_step) if self._judged is None else steps
+        return steps if len(self._decisions) == len(self._wanted) else max(number + 1, coat_step)
 
-    def _judges(self, number: int, coat_step: int) -> bool:
-        return self._judged is None and number == (0 if self._coat == "on" else coat_step)
+    def _new_tone(self, number: int, step: int) -> Tone | None:
+        """A tone curve, if this is the ``step`` in which it is judged, and there is one."""
+        if number != step or "tone" in self._decisions:
+            return None
+        tone, self._decisions["tone"] = judged_tone(self._hues(), self._wanted["tone"])
+        return tone
+
+    def _judged(self, number: int, step: int) -> Globals:
+        """Light and response as they are, with the tone curve that is right beside them, and the coat, which
+        is judged in the ``step``."""
+        shared = self._state.shared
+        if shared.tone is not None and number >= step:
+            shared = replace(shared, tone=steadied(shared.tone, self._hues()))
+            self._state = replace(self._state, shared=shared)
+        if "coat" not in self._decisions and number == (0 if self._wanted["coat"] == "on" else step):
+            shared = self._coated()
+        return shared
+
+    def _hues(self) -> Callable[[Tone], Hues]:
+        within, material = self._within()
+        return within.hues(material, self._state.shared, self._noise)
 
     def _coated(self) -> Globals:
         """Light and response with the coat that highlights call for, clipped ones included."""
@@ -236,7 +280,7 @@ class LightStage:
         material = at_pixels(shiny, solver.triangles, state.materials)
         seen = Within.of(shiny, self._surface, self._unit_mm)
         highlights = seen.highlights(material, state.shared, self._noise)
-        layer, self._judged = judged_coat(highlights, self._coat)
+        layer, self._decisions["coat"] = judged_coat(highlights, self._wanted["coat"])
         return replace(state.shared, coat=layer)
 
     def _better(self, best: Best | None, state: State) -> Best:
@@ -277,12 +321,12 @@ class LightStage:
         return moved, before - after
 
 
-def _started(operator: HashOperator, start: Start, relighting: Relighting) -> State:
+def _started(operator: HashOperator, start: Start, relighting: Relighting, tone: Tone | None) -> State:
     """Even tissue under the light of ``start``."""
     shown = torch.from_numpy(start.base_color) ** start.response.gamma
     mean = torch.cat([shown.median(dim=0).values, torch.tensor([roughness_to_raw(ROUGHNESS_TISSUE)])])
     options = {"specular": "specular" in relighting.effects, "bounce": relighting.bounces}
-    shared = Globals.of(start.light, start.response, F0_DIELECTRIC, **options)
+    shared = replace(Globals.of(start.light, start.response, F0_DIELECTRIC, **options), tone=tone)
     return State(operator, mean, torch.zeros(operator.forward_csr.shape[1], 4), shared)
 
 

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from endotwin.effects.coat import Coat
+from endotwin.effects.tone import Tone
 from endotwin.light import forward, shading
 from endotwin.light.forward import Lit, Lobes
 from endotwin.pixels.samples import Samples
@@ -27,12 +28,13 @@ class Globals:
     """What all pixels share, as one vector float64 [5] in the order of GLOBALS, or [6] of BOUNCE_GLOBALS.
 
     Without ``specular`` there is no specular lobe, and ln f0 stays where it is. A ``coat`` adds a lobe of its
-    own.
+    own; a ``tone`` bends what x^γ displays.
     """
 
     vector: Tensor
     specular: bool = True
     coat: Coat | None = None
+    tone: Tone | None = None
 
     @classmethod
     def of(
@@ -106,7 +108,8 @@ def _lit(samples: Samples, base_color: Tensor, shared: Globals) -> Lit:
 
 def predict(samples: Samples, material: Tensor, shared: Globals) -> Tensor:
     """Display values C [N, 3]; above 1 where a photo would clip."""
-    return shading.respond(radiance(samples, material, shared), shared.gamma)
+    untoned = shading.respond(radiance(samples, material, shared), shared.gamma)
+    return untoned if shared.tone is None else shared.tone.shown(untoned)
 
 
 def slope_by_log_exposure(samples: Samples, material: Tensor, shared: Globals) -> tuple[Tensor, Tensor]:
@@ -114,7 +117,10 @@ def slope_by_log_exposure(samples: Samples, material: Tensor, shared: Globals) -
     x = radiance(samples, material, shared)
     power = torch.exp(shared.gamma * torch.log(x + shading.RADIANCE_MIN))
     floor = math.exp(shared.gamma * math.log(shading.RADIANCE_MIN))
-    return power - floor, shared.gamma * power * x / (x + shading.RADIANCE_MIN)
+    untoned, slope = power - floor, shared.gamma * power * x / (x + shading.RADIANCE_MIN)
+    if shared.tone is None:
+        return untoned, slope
+    return shared.tone.shown(untoned), shared.tone.slope(untoned) * slope
 
 
 @dataclass(frozen=True)
@@ -132,6 +138,19 @@ class Linearised:
     by_roughness: Tensor
     by_globals: Tensor
     by_coat: Tensor | None
+
+    def toned(self, tone: Tone | None) -> Linearised:
+        """The same as the ``tone`` curve displays it."""
+        if tone is None:
+            return self
+        steep = tone.slope(self.predicted)
+        return Linearised(
+            predicted=tone.shown(self.predicted),
+            by_color=steep * self.by_color,
+            by_roughness=steep * self.by_roughness,
+            by_globals=steep[..., None] * self.by_globals,
+            by_coat=None if self.by_coat is None else steep * self.by_coat,
+        )
 
 
 def linearise(samples: Samples, material: Tensor, shared: Globals) -> Linearised:
@@ -185,4 +204,4 @@ def linearise(samples: Samples, material: Tensor, shared: Globals) -> Linearised
         by_roughness=slope * (color_slope[:, None] * base_color + shine_slope[:, None]),
         by_globals=torch.stack(by_globals, dim=-1),
         by_coat=None if coat is None else slope * coat,
-    )
+    ).toned(shared.tone)

@@ -16,8 +16,9 @@ import numpy as np
 import torch
 
 from endotwin.effects import Decision, Effect, Effects
+from endotwin.effects.tone import Tone
 from endotwin.errors import SequenceError
-from endotwin.evidence.decide import decide
+from endotwin.evidence.decide import Decided, decide
 from endotwin.evidence.glints import Glints
 from endotwin.fit.bloom import bloom
 from endotwin.fit.film import Found, Model
@@ -32,7 +33,7 @@ from endotwin.light.film import Film
 from endotwin.pixels.length_unit import unit_mm
 from endotwin.pixels.pace import ITERATIONS, Pace
 from endotwin.pixels.samples import Samples, Views, drawn, gather
-from endotwin.pixels.start import ALBEDO_TOP, BRIGHT, closed_form, start_at
+from endotwin.pixels.start import ALBEDO_TOP, BRIGHT, Start, closed_form, start_at
 from endotwin.run.threads import THREADS
 from endotwin.surface import Surface
 from endotwin.surface.casting import Caster
@@ -103,24 +104,26 @@ def fit_twin(
 
         decided = decide(samples[every], twin, caster, glints, states, pace.light_is_over)
         relighting = Relighting(surface, caster, decided.effects, samples.views)
-        if decided.light is not None:
-            start = start_at(
-                samples[telling],
-                surface.triangles,
-                len(surface.vertices_mm),
-                decided.light,
-                decided.gamma,
-            )
+        shown = samples[telling]
         samples = lit(samples, surface, caster, relighting.effects)
     with stopwatch.stage("light"):
-        wanted = states.get("coat", "auto") if "specular" in decided.effects else "off"
+        wanted = {name: states.get(name, "auto") for name in ("coat", "tone")}
+        if "specular" not in decided.effects:
+            wanted["coat"] = "off"
         count = min(LIGHT_PIXELS, int(LIGHT_SHARE * pace.start_pixels))
         rows = telling[torch.from_numpy(drawn(len(telling), count, np.random.default_rng(seed)))]
         white = np.flatnonzero(smooth & clipped)
         count = len(white) * len(rows) // len(every)
         white = white[drawn(len(white), count, np.random.default_rng(seed))]
         parts = samples[rows], samples[torch.from_numpy(white)]
-        state, cost, coat = LightStage(*parts, surface, start, pace, relighting, wanted, device).found()
+
+        def started(tone: Tone | None) -> Start:
+            """Where the fit starts with a tone curve taken off the photos."""
+            if tone is None and decided.light is None:
+                return start
+            return _start(shown if tone is None else shown.untoned(tone), surface, decided)
+
+        state, cost, judged = LightStage(*parts, surface, started, pace, relighting, wanted, device).found()
     with stopwatch.stage("detail"):
         samples = relighting.guided(samples)
         state, normals, left = _find_detail(samples, twin, state, cost, pace, relighting, device)
@@ -134,7 +137,7 @@ def fit_twin(
             *(" and ".join(odd), twin.source.path),
         )
     with stopwatch.stage("price"):
-        decisions = {**decided.decisions, "coat": coat, **why}
+        decisions = {**decided.decisions, **judged, **why}
         if "interreflection" in decided.effects and not relighting.bounces:
             decisions["interreflection"] = _without_bounce(decisions["interreflection"])
         if left is not None and (said := residual_warning(left, twin.sequence(), decisions)):
@@ -146,6 +149,14 @@ def fit_twin(
     return fitted.with_record(
         fit={"method": "twin", "undetermined": list(start.undetermined), **stopwatch.to_dict()}
     )
+
+
+def _start(samples: Samples, surface: Surface, decided: Decided) -> Start:
+    """Where the fit starts under the light that was decided."""
+    mesh = surface.triangles, len(surface.vertices_mm)
+    if decided.light is None:
+        return closed_form(samples, *mesh)
+    return start_at(samples, *mesh, decided.light, decided.gamma)
 
 
 def _beyond(
@@ -257,9 +268,11 @@ def _fitted(
     scale = float(ALBEDO_TOP / np.percentile(brightest, 98))
     if effects.bounce > 0:
         scale = math.exp(state.shared.log_scale)
-    light, coat = state.shared.light, state.shared.coat
+    light, coat, tone = state.shared.light, state.shared.coat, state.shared.tone
     if coat is not None:
         effects = effects.including(replace(coat, weight=coat.weight * scale))
+    if tone is not None:
+        effects = effects.including(tone)
     if (glitter := effects.get("sparkle")) is not None:
         effects = effects.including(replace(glitter, weight=glitter.weight * scale))
     return replace(

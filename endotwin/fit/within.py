@@ -24,7 +24,9 @@ import torch
 from torch import Tensor
 
 from endotwin.effects.coat import Coat
+from endotwin.effects.tone import Tone, bend
 from endotwin.evidence.coat import LEAST_SIGHTINGS, Highlights
+from endotwin.evidence.tone import Hues
 from endotwin.fit.gauss_newton import (
     F0,
     ROUGHNESS_LOGIT_SPREAD,
@@ -55,6 +57,9 @@ RATIOS = torch.tensor([[1.0, -1.0, 0.0], [0.5, 0.5, -1.0]], dtype=torch.float64)
 
 COAT_SPREAD = 2.0
 """Standard deviation of a coat's weight about 0: tissue is wet, not lacquered."""
+
+HUE_PIXELS = 100_000
+"""Of those that tell a tone curve, all of some vertices."""
 
 HIGHLIGHT_PIXELS = 30_000
 """Of the highlights, all of some vertices; more would not change the mind about a coat."""
@@ -188,6 +193,40 @@ class Within:
 
         return under
 
+    def hues(self, material: Tensor, shared: Globals, noise: float) -> Callable[[Tone], Hues]:
+        """Ratios of channels off the highlights, by the tone curve that is taken off the photos.
+
+        Args:
+            material: [N, 4] at the samples. noise: of a pixel, in display values.
+        """
+        diffuse = self.samples.sin2 > DIFFUSE_SIN2
+        diffuse &= torch.from_numpy(self.vertex % max(1, int(diffuse.sum()) // HUE_PIXELS) == 0)
+        rows = self._coloured(diffuse)
+        model = linearise(self.samples[rows], material[rows], replace(shared, tone=None))
+        bright = ((model.predicted > DARKEST) & (model.predicted < 1)).all(dim=1)
+        rows, predicted = rows[bright], model.predicted[bright].double()
+        shown = self.samples.color[rows].double().numpy() / 255
+        by_raw = roughness_slope(material[rows, 3])[:, None]
+        by_tissue = model.by_globals[bright][..., F0], model.by_roughness[bright] * by_raw
+
+        def without(tone: Tone) -> Hues:
+            steep, found = predicted * tone.slope(predicted), []
+            untoned = torch.log(torch.from_numpy(tone.undone(shown)) / predicted)
+            relative = [untoned, *(x / predicted for x in by_tissue), bend(predicted) / steep]
+            for number, ratio in enumerate(RATIOS):
+                variance = (noise / steep) ** 2 @ ratio**2 + RATIO_ERROR**2
+                columns = tuple((x @ ratio).numpy() for x in relative)
+                place, _, *means, total = self._means(rows, columns, 1 / variance.numpy())
+                found.append((place + number * self.count, means[0], np.stack(means[1:], axis=1), total))
+            return Hues(*map(np.concatenate, zip(*found, strict=True)))
+
+        return without
+
+    def _coloured(self, chosen: Tensor) -> Tensor:
+        """Rows [R] of the ``chosen`` samples (bool [N]) in which no channel is dark or clipped."""
+        shown = self.samples.color
+        return torch.nonzero(chosen & (shown.amin(dim=1) > DARK) & (shown.amax(dim=1) < BRIGHT))[:, 0]
+
     def _step(
         self,
         material: Tensor,
@@ -293,8 +332,7 @@ class Within:
     def _ratios(self, material: Tensor, shared: Globals, chosen: Tensor, noise: float) -> Sightings:
         """Sightings of the RATIOS of channels of the ``chosen`` samples in which none is dark or clipped, as
         vertices of their own; no gain changes them: they are of the first frame."""
-        shown = self.samples.color
-        rows = torch.nonzero(chosen & (shown.amin(dim=1) > DARK) & (shown.amax(dim=1) < BRIGHT))[:, 0]
+        rows, shown = self._coloured(chosen), self.samples.color
         model = linearise(self.samples[rows], material[rows], shared)
         bright = (model.predicted > DARKEST).all(dim=1)
         rows, predicted = rows[bright], model.predicted[bright].double()
@@ -317,13 +355,18 @@ class Within:
     ) -> Sightings:
         """Sightings of samples ``rows``: means of residual, slopes by roughness and coat, by ``count`` shared
         parameters and by guides, each [R]."""
+        vertex, frame, *means, total = self._means(rows, columns, weight)
+        slopes, by_guides = np.split(np.stack(means[3:], axis=1), [count], axis=1)
+        return Sightings(vertex, frame, means[0], slopes, *means[1:3], by_guides, total)
+
+    def _means(self, rows: Tensor, columns: tuple[np.ndarray, ...], weight: np.ndarray) -> list[np.ndarray]:
+        """Vertex, frame, means of the ``columns`` and sum of the weights of what the samples ``rows`` [R]
+        show of a vertex in one photo, each [S]."""
         place = self.vertex[rows.numpy()].astype(np.int64) << 32 | self.samples.frame[rows].numpy()
         place, which = np.unique(place, return_inverse=True)
         total = np.bincount(which, weight, len(place))
         means = [np.bincount(which, weight * column, len(place)) / total for column in columns]
-        slopes, by_guides = np.split(np.stack(means[3:], axis=1), [count], axis=1)
-        frame = (place & 0xFFFFFFFF).astype(np.int32)
-        return Sightings(place >> 32, frame, means[0], slopes, *means[1:3], by_guides, total)
+        return [place >> 32, (place & 0xFFFFFFFF).astype(np.int32), *means, total]
 
     def _by_guides(
         self,

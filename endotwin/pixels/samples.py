@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from endotwin.cameras.base import Camera
+from endotwin.effects.tone import Tone
 from endotwin.light.bounced import Bounce
 from endotwin.light.forward import Lit
 from endotwin.light.guides import Guided
@@ -143,6 +144,12 @@ class Samples:
         if self.guides is not None:
             return Lit(self.cos, self.guides, **more)
         return Lit.at_lens(self.cos, self.sin2, self.log_cos_axis, self.log_distance, **more)
+
+    def untoned(self, tone: Tone) -> Samples:
+        """The same samples with a tone curve taken off their photos."""
+        levels = np.arange(256, dtype=np.float32) / 255
+        level = torch.from_numpy(np.rint(255 * tone.undone(levels)).astype(np.uint8))
+        return replace(self, color=level[self.color.long()])
 
     def thinned(self, count: int, generator: np.random.Generator) -> Samples:
         """About ``count`` of the samples, drawn evenly at random; all of them if there are no more."""

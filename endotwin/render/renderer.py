@@ -14,7 +14,6 @@ import torch
 
 from endotwin.cameras import Camera
 from endotwin.errors import OptionError, TwinError
-from endotwin.light import shading
 from endotwin.light.forward import Lit
 from endotwin.light.incidence import to_camera
 from endotwin.render.illumination import Illumination, ViewLight
@@ -265,7 +264,7 @@ class Renderer:
 
     def _displayed(self, radiance: np.ndarray) -> np.ndarray:
         """Display values of ``radiance`` [H, W, 3], beyond 1 where they clip."""
-        return shading.respond(torch.from_numpy(radiance), self.twin.response.gamma).numpy()
+        return self.twin.displayed(torch.from_numpy(radiance)).numpy()
 
     def _points(
         self, rays: Camera | Rays, hits: Correspondences, light: ViewLight, T_world_camera: np.ndarray

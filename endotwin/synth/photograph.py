@@ -10,7 +10,6 @@ import torch
 from endotwin.effects import RENDERED
 from endotwin.effects.exposure import Shot, expose
 from endotwin.effects.video import Clip, Video
-from endotwin.light import shading
 from endotwin.render import Renderer, View
 
 EXPOSURE = ("motion_blur", "rolling_shutter")
@@ -54,7 +53,7 @@ def photographed(
 
     shot = Shot(camera, T_world_camera, T_world_next, view.depth_mm)
     radiance = effects["interlacing"].woven(seen, shot) if "interlacing" in effects else seen(shot)
-    color = shading.respond(radiance, renderer.twin.response.gamma).clamp(0, 1).numpy()
+    color = renderer.twin.displayed(radiance).clamp(0, 1).numpy()
     if "noise" in effects:
         color = effects["noise"].read(color, generator)
     for effect in (effects[name] for name in RECORDING if name in effects):

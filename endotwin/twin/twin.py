@@ -19,7 +19,7 @@ from endotwin.cameras import Camera, camera_from_dict
 from endotwin.effects import Decision, Effects
 from endotwin.errors import SequenceError, TwinError
 from endotwin.light.film import Film
-from endotwin.light.shading import F0_DIELECTRIC
+from endotwin.light.shading import F0_DIELECTRIC, respond
 from endotwin.run.jsontext import parsed
 from endotwin.run.output import TWIN, write_folder
 from endotwin.sequence import Sequence, Split
@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     import open3d
     import pyvista
     import trimesh
+    from torch import Tensor
 
     from endotwin.render import Renderer, View
 
@@ -199,6 +200,15 @@ class Twin:
     def film(self) -> Film | None:
         """The film of fluid that is seen; None without one, or without the effect."""
         return self.materials.film if self.fitted and "film" in self.effects else None
+
+    def displayed(self, radiance: Tensor) -> Tensor:
+        """Display values of radiance ≥ 0, of its shape; above 1 where a photo would clip."""
+        color = respond(radiance, self.response.gamma)
+        return self.effects["tone"].shown(color) if "tone" in self.effects else color
+
+    def untoned(self, photo: np.ndarray) -> np.ndarray:
+        """Display values in 0 … 1, of the photo's shape, as they are without a tone curve: x^γ."""
+        return self.effects["tone"].undone(photo) if "tone" in self.effects else photo
 
     def __repr__(self) -> str:
         lines = [repr(self.surface), f"camera: {self.camera.model} {self.camera.width}×{self.camera.height}"]

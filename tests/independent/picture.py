@@ -115,7 +115,7 @@ class Studio:
             for down in (np.arange(SAMPLES) + 0.5) / SAMPLES - 0.5:
                 view = self.view(frame, (u + aside).ravel(), (v + down).ravel())
                 x[view.ray] += self.radiance(view, scene) / SAMPLES**2
-        shown = 255 * displayed(x, scene.gamma) + scene.noise_levels * rng.standard_normal(x.shape)
+        shown = 255 * displayed(x, scene) + scene.noise_levels * rng.standard_normal(x.shape)
         inside = lens.lit(u, v)
         photo = np.rint(np.clip(shown, 0, 255)).astype(np.uint8).reshape(*u.shape, 3) * inside[..., None]
         return photo, self._depth_mm(frame, lens.rays(u, v).reshape(-1, 3)).reshape(u.shape) * inside
@@ -167,6 +167,8 @@ class Studio:
         self.scene = replace(self.scene, L0=self.scene.L0 * factor)
 
 
-def displayed(x: np.ndarray, gamma: float) -> np.ndarray:
-    """Display values in [0, 1] of radiance x."""
-    return np.minimum(np.maximum(x, 0) ** gamma, 1)
+def displayed(x: np.ndarray, scene: Scene) -> np.ndarray:
+    """Display values in [0, 1] of radiance x: x^γ, and with a tone curve as much of its smooth step."""
+    value = np.minimum(np.maximum(x, 0) ** scene.gamma, 1)
+    tone = scene.tone if "tone" in scene.effects else 0.0
+    return (1 - tone) * value + tone * value**2 * (3 - 2 * value)

@@ -11,7 +11,7 @@ from independent.lens import Lens
 from independent.light import AT_LENS, Lamp
 from independent.path import KINDS
 
-EFFECTS = ("offset", "shadows", "interreflection", "gain", "profile", "vignetting", "coat")
+EFFECTS = ("offset", "shadows", "interreflection", "gain", "profile", "vignetting", "coat", "tone")
 """In the order in which light meets them; shadows come and go with an offset."""
 
 CHANCES = {
@@ -23,6 +23,9 @@ CHANCES = {
     "coat": 0.4,
 }
 
+TONED = 0.3
+"""Chance of a tone curve, which is drawn apart from the rest."""
+
 
 @dataclass(frozen=True)
 class Scene:
@@ -31,7 +34,8 @@ class Scene:
     Attributes:
         gamma: C = x^γ. n, q: of the lamp. L0: its strength, set so that the photos are well exposed.
         guides_mm: in the camera frame. vignetting: k of e^{−k r²}. gain: factor between the darkest and the
-            brightest frame. coat_weight, coat_roughness: of the film of water. diffuse: burley or lambert.
+            brightest frame. tone: share of a smooth step. coat_weight, coat_roughness: of the film of water.
+            diffuse: burley or lambert.
         roughness, f0: of the tissue's lobe. noise_levels: standard deviation in 1/255.
     """
 
@@ -43,6 +47,7 @@ class Scene:
     guides_mm: tuple[tuple[float, float, float], ...]
     vignetting: float
     gain: float
+    tone: float
     coat_weight: float
     coat_roughness: float
     diffuse: str
@@ -59,6 +64,9 @@ class Scene:
         """The scene of a seed, with effects among ``only``; all else is the same whatever they are."""
         rng = np.random.default_rng([seed, 0])
         drawn = {name for name, chance in CHANCES.items() if rng.random() < chance}
+        apart = np.random.default_rng([seed, 2])
+        if apart.random() < TONED:
+            drawn.add("tone")
         effects = drawn & set(only)
         if "offset" in effects:
             effects.add("shadows")
@@ -71,6 +79,7 @@ class Scene:
             guides_mm=_guides(rng),
             vignetting=float(rng.uniform(0.15, 0.5)),
             gain=float(rng.uniform(1.3, 2.5)),
+            tone=float(apart.uniform(0.15, 0.4)),
             coat_weight=float(rng.uniform(0.5, 1)),
             coat_roughness=float(np.exp(rng.uniform(np.log(0.06), np.log(0.25)))),
             diffuse=str(rng.choice(["burley", "lambert"], p=[0.7, 0.3])),

@@ -7,6 +7,8 @@ of the scene's other effects. The light's profile and the lens's vignetting are 
 show beside the other. What remains is what the effect shows, as root mean square. The light that bounces
 stays as it is while guides and profile change.
 
+A tone curve is judged on the photos' values, all else on what they are without one.
+
 In the same way, what a wrong γ, n or q shows is what is left of its change after the best fit of all else:
 the smaller, the more does a small fault of a model bend it.
 """
@@ -40,12 +42,13 @@ def shown_levels(studio: Studio) -> dict[str, dict[str, float]]:
     """Of each effect of the studio's scene: ``levels`` of 255 that it shows, and ``db`` by which a perfect
     model without it would lie above the photos' noise."""
     scene, pixels = studio.scene, Pixels(studio)
-    full = displayed(pixels.radiance(scene.effects), scene.gamma)
     found = {}
     for name in sorted(scene.effects):
-        lacking = scene.without(name).effects
+        present = scene.effects if name == "tone" else scene.effects - {"tone"}
+        lacking = scene.having(present).without(name).effects
         x = pixels.radiance(lacking)
-        value = displayed(x, scene.gamma)
+        value = displayed(x, scene.having(lacking))
+        full = displayed(pixels.radiance(present), scene.having(present))
         columns = {"gamma": np.log(x), "n": pixels.log_axis, "q": pixels.log_distance}
         left = pixels.left(full - value, value, [*columns.values(), *pixels.taken_up(_rest(name, lacking))])
         found[name] = {"levels": left, "db": 10 * math.log10(1 + left**2 / (scene.noise_levels**2 + 1 / 12))}
@@ -56,7 +59,7 @@ def wrong_levels(studio: Studio) -> dict[str, float]:
     """Levels of 255 that γ, n and q show where each is ``WRONG`` and all else fits as well as it can."""
     scene, pixels = studio.scene, Pixels(studio)
     x = pixels.radiance(scene.effects)
-    value = displayed(x, scene.gamma)
+    value = displayed(x, scene.without("tone"))
     columns = {"gamma": np.log(x), "n": scene.n * pixels.log_axis, "q": scene.q * pixels.log_distance}
     taken_up = pixels.taken_up(_rest("", scene.effects))
     found = {}

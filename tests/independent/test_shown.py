@@ -25,7 +25,7 @@ def pixels(scene: Scene) -> Pixels:
 def test_what_the_rest_of_a_model_can_say_is_not_shown(scene: Scene, pixels: Pixels) -> None:
     """A wrong γ or q, and an albedo of its own for each cell of the wall, leave nothing."""
     x = pixels.radiance(scene.effects)
-    value = displayed(x, scene.gamma)
+    value = displayed(x, scene)
     slope, columns = pixels.unclipped(value), [np.log(x), pixels.log_distance]
     albedo = np.random.default_rng(0).normal(size=10**5)[pixels.cell]
     change = slope * (0.02 * columns[0] - 0.3 * columns[1] + 0.1 * albedo)
@@ -35,7 +35,7 @@ def test_what_the_rest_of_a_model_can_say_is_not_shown(scene: Scene, pixels: Pix
 
 def test_noise_is_shown_but_for_what_the_cells_take_up(scene: Scene, pixels: Pixels) -> None:
     """White noise loses a degree of freedom a cell: its mean square falls by cells/pixels."""
-    value = displayed(pixels.radiance(scene.effects), scene.gamma)
+    value = displayed(pixels.radiance(scene.effects), scene)
     noise = np.random.default_rng(0).normal(size=len(value))
     left = 1 - (pixels.cell.max() + 1) / len(value)
     assert pixels.left(noise, value, []) == pytest.approx(255 * np.sqrt(left), rel=0.02)

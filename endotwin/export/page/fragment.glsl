@@ -7,7 +7,7 @@ in float rough, mirrored;
 out vec4 shown;
 
 const float PI = 3.14159265358979, COS_MIN = 1e-4, ROUGHNESS_MIN = 0.045, RADIANCE_MIN = 1e-6;
-uniform float L0, n, q, profile, gamma, f0, burley, roughness, exposure;
+uniform float L0, n, q, profile, gamma, tone, f0, burley, roughness, exposure;
 uniform float coat_f0, coat_roughness, coat_tail;
 uniform vec2 vignetting;   // k2, k4
 uniform vec4 image;        // fx, fy, cx, cy in px
@@ -63,5 +63,6 @@ void main() {
   float passed = exposure * exp(vignetting.x * r2 + vignetting.y * r2 * r2);
   vec3 facing = faceforward(normal, point, normal);  // the back of a sliver at a rim is no black dot
   vec3 x = passed * (radiance(normalize(facing), clamp(rough * roughness, 0.0, 1.0)) + mirrored);
-  shown = vec4(exp(gamma * log(x + RADIANCE_MIN)) - exp(gamma * log(RADIANCE_MIN)), 1.0);
+  vec3 untoned = min(exp(gamma * log(x + RADIANCE_MIN)) - exp(gamma * log(RADIANCE_MIN)), 1.0);
+  shown = vec4(mix(untoned, untoned * untoned * (3.0 - 2.0 * untoned), tone), 1.0);
 }

@@ -137,6 +137,7 @@ function draw() {
   set1("L0", look.L0 * state.intensity * look.usual_mm ** (state.q - look.q));
   set1("profile", look.profile);
   set1("gamma", look.gamma);
+  set1("tone", look.tone);
   set1("burley", look.burley ? 1 : 0);
   set1("coat_roughness", look.coat_roughness || 0.12);
   set1("coat_tail", look.coat_tail);

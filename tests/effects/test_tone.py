@@ -1,0 +1,84 @@
+"""The tone curve against closed forms, and what hues say of it."""
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from endotwin.effects.tone import Tone, bend
+from endotwin.evidence.tone import LEAST_CONTRAST, Hues, judged, steadied
+
+CONTRASTS = st.floats(-0.9, 0.9)
+RAMP = torch.linspace(0, 1.3, 1301, dtype=torch.float64)
+
+
+@settings(deadline=None)
+@given(CONTRASTS)
+def test_the_curve_rises_and_keeps_black_middle_and_white(contrast):
+    tone = Tone(contrast)
+    fixed = torch.tensor([0.0, 0.5, 1.0], dtype=torch.float64)
+    torch.testing.assert_close(tone.shown(fixed), fixed)
+    assert (tone.shown(RAMP).diff() > 0).all()
+    assert float(tone.slope(fixed)[1]) == pytest.approx(1 + contrast / 2)
+
+
+@settings(deadline=None)
+@given(CONTRASTS)
+def test_slopes_by_value_and_contrast_are_central_differences(contrast):
+    step = 1e-6
+    found = (Tone(contrast).shown(RAMP + step) - Tone(contrast).shown(RAMP - step))[1:] / (2 * step)
+    torch.testing.assert_close(Tone(contrast).slope(RAMP)[1:], found, rtol=1e-5, atol=2e-6)
+    found = (Tone(contrast + step).shown(RAMP) - Tone(contrast - step).shown(RAMP)) / (2 * step)
+    torch.testing.assert_close(bend(RAMP), found, rtol=1e-6, atol=1e-8)
+
+
+@settings(deadline=None)
+@given(CONTRASTS)
+def test_what_is_undone_was_shown(contrast):
+    inside = RAMP[RAMP <= 1]
+    np.testing.assert_allclose(Tone(contrast).undone(Tone(contrast).shown(inside).numpy()), inside, atol=1e-6)
+
+
+def hues_of(contrast: float, white: float = 0.3, seed: int = 0):
+    """Hues of 2000 places in 6 photos, whose prediction errs by ``white`` in all channels alike."""
+    rng = np.random.default_rng(seed)
+    place, color = np.repeat(np.arange(2000), 6), rng.uniform(0.15, 0.9, (2000, 3))
+    brightness = rng.uniform(0.3, 1.0, len(place))
+    value = torch.from_numpy(color[place] * brightness[:, None])
+    lit = value * torch.from_numpy(np.exp(white * rng.standard_normal((len(place), 1)))).clamp(max=1 / 0.9)
+    photo = Tone(contrast).shown(lit) + 0.004 * torch.from_numpy(rng.standard_normal(value.shape))
+
+    def without(tone: Tone) -> Hues:
+        shown, bent = np.log(tone.undone(photo.numpy())), bend(value) / value / tone.slope(value)
+        residual, slope = (x[:, 0] - x[:, 1] for x in (shown, bent.numpy()))
+        slopes = np.c_[rng.standard_normal((len(place), 2)), slope]
+        return Hues(place, residual, slopes, np.ones(len(place)))
+
+    return without
+
+
+@pytest.mark.parametrize("contrast", [-0.4, 0.2, 0.4])
+def test_a_curve_is_found_by_hues_whatever_brightness_says(contrast):
+    tone, decision = judged(hues_of(contrast), "auto")
+    assert decision.state == "on" and tone.contrast == pytest.approx(contrast, abs=0.03)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_no_curve_is_found_where_there_is_none(seed):
+    tone, decision = judged(hues_of(0.0, seed=seed), "auto")
+    assert tone is None and decision.state == "off"
+    assert abs(steadied(Tone(), hues_of(0.0, seed=seed)).contrast) < LEAST_CONTRAST / 2
+
+
+def test_a_curve_is_on_and_off_as_it_is_asked_for():
+    assert judged(hues_of(0.4), "off")[0] is None
+    tone, decision = judged(hues_of(0.0), "on")
+    assert tone is not None and decision.reason.startswith("forced on")
+
+
+def test_too_few_hues_say_nothing():
+    def without(tone: Tone) -> Hues:
+        return Hues(np.zeros(0, int), np.zeros(0), np.zeros((0, 3)), np.zeros(0))
+
+    assert judged(without, "auto")[0] is None and judged(without, "on")[0] == Tone()
