@@ -1,7 +1,10 @@
 """Bounced light at points, against what an integrating sphere makes of it."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+import scipy.sparse
 import torch
 import trimesh
 from independent.gloss import Gloss
@@ -73,6 +76,25 @@ def test_one_view_is_as_one_of_several(sphere):
     alone = Places(places.weights, 0 * places.view).of(np.ones((places.weights.shape[1], 1, 3)))
     np.testing.assert_allclose(alone, 1, rtol=1e-6)
     np.testing.assert_allclose(several[::2].mean(), several[1::2].mean(), rtol=0.01)
+
+
+def test_what_points_mirror_is_the_radiosity_of_tissue_over_their_own_irradiance(sphere):
+    """Places mirror those before them, and every third one nothing that was seen."""
+    light, places, albedo = sphere
+    seen = np.arange(len(places.view)) % 3 > 0
+    before = places.weights[np.arange(len(seen)) - 1]
+    rows = scipy.sparse.diags_array(seen.astype(np.float32)).tocsr() @ before
+    rows.eliminate_zeros()
+    irradiance, leaving = (Places(before, places.view).of(x) for x in light.between(0.5, 2.0, albedo))
+    own = light.at(places, 0.5, 2.0, albedo)
+    found = light.expanded(
+        replace(places, mirrored=scipy.sparse.csr_array(rows)), 0.5, 2.0, albedo, torch.zeros(len(seen))
+    )
+    np.testing.assert_allclose(found.contrast[seen], (leaving / own)[seen], rtol=1e-4)
+    assert (found.contrast[~seen] == 1).all()
+    assert (leaving > BASE_COLOR * irradiance).all()
+    there = found.irradiance(0.5, 2.0)
+    torch.testing.assert_close(found.mirrored(there), there * found.contrast)
 
 
 def test_the_expansion_is_exact_where_it_was_made_and_follows_the_light(sphere):

@@ -50,19 +50,19 @@ def test_light_and_lobes_are_those_of_an_independent_renderer(points, guides_mm,
         np.testing.assert_allclose((arriving * shine).numpy(), glossy, rtol=5e-3, atol=1e-6)
 
 
-def test_even_surroundings_shine_as_the_lobes_integral_says() -> None:
-    """Away from grazing angles: below cos = 0.4 the fit lacks up to a sixth of the lobe."""
-    cos, roughness = (grid.ravel() for grid in np.meshgrid(np.linspace(0.5, 1, 9), np.linspace(0.25, 0.8, 9)))
-    fit = shading.specular_of_even_light(torch.from_numpy(cos), torch.from_numpy(roughness), 0.04).numpy()
-    np.testing.assert_allclose(fit, Gloss(0.04).at(cos, roughness), atol=0.01)
+@pytest.mark.parametrize("f0", [0.02, 0.04])
+def test_even_surroundings_shine_as_the_lobes_integral_says(f0) -> None:
+    cos, roughness = (grid.ravel() for grid in np.meshgrid(np.linspace(0.1, 1, 9), np.linspace(0.1, 0.9, 9)))
+    found = shading.specular_of_even_light(torch.from_numpy(cos), torch.from_numpy(roughness), f0).numpy()
+    np.testing.assert_allclose(found, Gloss(f0).at(cos, roughness), atol=0.005)
 
 
 def test_a_coat_reflects_even_surroundings_as_a_film_of_water_does() -> None:
-    cos, roughness = np.linspace(0.5, 1, 9), np.full(9, 0.4)
+    cos, roughness = np.linspace(0.2, 1, 9), np.full(9, 0.4)
     bare, wet = (Lobes(0.04, coat=coat) for coat in (None, (0.7, 0.3, 2.0)))
     arguments = torch.from_numpy(cos), torch.from_numpy(roughness)
     more = (wet.gloss(*arguments) - bare.gloss(*arguments)).numpy()
-    np.testing.assert_allclose(more, 0.7 * Gloss(0.02).at(cos, np.full(9, 0.3)), atol=0.007)
+    np.testing.assert_allclose(more, 0.7 * Gloss(0.02).at(cos, np.full(9, 0.3)), atol=0.003)
     assert not Lobes(0.0).gloss(*arguments).any()
 
 
@@ -70,4 +70,4 @@ def test_all_that_white_lobes_send_back_is_the_mean_over_directions() -> None:
     roughness, lobes = np.array([0.3, 0.5, 0.7]), Lobes(0.04, coat=(0.5, 0.3, 2.0))
     expected = Gloss(0.04).mean(roughness) + 0.5 * Gloss(0.02).mean(np.full(3, 0.3))
     found = lobes.glossy_albedo(torch.from_numpy(roughness)).numpy()
-    np.testing.assert_allclose(found, expected, atol=0.012)
+    np.testing.assert_allclose(found, expected, rtol=0.02)

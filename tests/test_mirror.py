@@ -1,4 +1,5 @@
-"""What white lobes throw on of a lamp's light, against the independent renderer's facets."""
+"""What white lobes throw on of a lamp's light, against the independent renderer's facets; and what they
+mirror to the camera, in closed form."""
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from independent.wall import Wall
 
 from endotwin.light.forward import Lobes
 from endotwin.light.guides import COSINE
+from endotwin.light.mirror import met_mirrored
 from endotwin.light.radiosity import Radiosity
 from endotwin.light.shading import F0_DIELECTRIC, ROUGHNESS_TISSUE
 from endotwin.surface import Surface
@@ -65,3 +67,24 @@ def ring_means(z_mm: np.ndarray, values: np.ndarray) -> np.ndarray:
     edges_mm = np.arange(3 - AHEAD_MM, LENGTH_MM - AHEAD_MM, 6.0)
     ring = np.digitize(z_mm, edges_mm)
     return np.array([values[ring == k].mean() for k in range(1, len(edges_mm))])
+
+
+def test_a_floor_mirrors_the_wall_where_the_law_of_reflection_says() -> None:
+    """A floor z = 0 before a wall x = 10, seen from 4 above its edge: (x, y) shows the wall at height
+    4·(10 − x)/x; and nothing where nothing is."""
+    corners_mm = [(0, -9, 0), (10, -9, 0), (10, 9, 0), (0, 9, 0), (10, -9, 9), (10, 9, 9)]
+    faces = np.array([(0, 1, 2), (0, 2, 3), (1, 4, 5), (1, 5, 2)])
+    surface = Surface.from_mesh(np.array(corners_mm, float), faces, np.zeros((6, 3)))
+    here = surface.origin_mm
+    generator = np.random.default_rng(0)
+    points = np.c_[generator.uniform(1, 9.5, 500), generator.uniform(-5, 5, 500), np.zeros(500)]
+    eye, normals = np.tile([0.0, 0.0, 4.0], (500, 1)), np.tile(np.float32([0, 0, 1]), (500, 1))
+    triangle, barycentric = met_mirrored(
+        Caster(surface), np.float32(points - here), np.float32(eye - here), normals
+    )
+    expected = points * (10 / points[:, :1]) + [0, 0, 4] * (10 / points[:, :1] - 1)
+    shown = (np.abs(expected[:, 1]) < 9) & (expected[:, 2] < 9)
+    assert 100 < shown.sum() < 400
+    np.testing.assert_array_equal(triangle >= 0, shown)
+    met = np.einsum("nk,nka->na", barycentric, surface.vertices_mm[surface.triangles[triangle]]) + here
+    np.testing.assert_allclose(met[shown], expected[shown], atol=0.05)

@@ -18,11 +18,11 @@ RAMP = np.linspace(0.0, 1.0, 4097)
 class Tone(Effect):
     """C' = C + contrast·(3C² − 2C³ − C) of display values C, with its slope at white beyond.
 
-    It rises, and leaves 0, ½ and 1 in their places. A contrast below 0 lifts what is dark.
+    It rises, and leaves 0, ½ and 1 in their places.
     """
 
     name: ClassVar[str] = "tone"
-    contrast: float = parameter(0.0, -0.9, 0.9)
+    contrast: float = parameter(0.0, 0.0, 0.9)
 
     def shown(self, color: Tensor) -> Tensor:
         """C' of C ≥ 0, of its shape."""

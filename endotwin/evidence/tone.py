@@ -2,7 +2,8 @@
 
 White light makes a place brighter or darker and leaves the ratios of its channels; so does any power of the
 three. A curve that is no power does not. Whatever else the model of the light errs by, where it falls, how
-fast, and how strong a photo's gain is, changes all channels alike, and cannot pass for one.
+fast, and how strong a photo's gain is, changes all channels alike, and cannot pass for one. What throws red
+light into the dark, as tissue does, makes hues steadier with a contrast below 0: no processor has that.
 """
 
 from __future__ import annotations
@@ -21,8 +22,12 @@ from endotwin.pixels.fixed_effects import Design, regress
 LEAST_SIGHTINGS = 16
 ROUNDS = 4
 
+TISSUE = 2
+"""Slopes by what whitens: f0 and roughness."""
+
 LEAST_CONTRAST = 0.1
-"""Less is none: bounced light that is not quite known turns hues with brightness, too, up to half so far."""
+"""Less is none: it changes values by 2.5 of 255 levels at most, and beside bounced light hues are known no
+better."""
 
 
 @dataclass(frozen=True)
@@ -31,8 +36,9 @@ class Hues:
 
     Attributes:
         place: int [S], the vertex, another for each of the ratios. residual: ln of the photo's ratio less
-            that of the prediction's [S]. slopes: what ln f0, the logit of roughness and contrast beyond the
-            curve's would add to it [S, 3]. weight: inverse variance [S].
+            that of the prediction's [S]. slopes: what would be added to it by ln f0, by the logit of
+            roughness, where light bounces by the logarithm of its strength, and by contrast, [S, 3 or 4].
+        weight: inverse variance [S].
     """
 
     place: np.ndarray
@@ -40,15 +46,19 @@ class Hues:
     slopes: np.ndarray
     weight: np.ndarray
 
-    def design(self, curve: bool = True) -> Design:
-        """f0, roughness and, with a ``curve``, contrast, beside an intercept a place."""
-        columns = self.slopes if curve else self.slopes[:, :2]
+    def design(self, passing: int = TISSUE, curve: bool = True) -> Design:
+        """What may pass for a curve, as many of the first slopes, and, with a ``curve``, contrast; beside an
+        intercept a place."""
+        columns = [*range(passing), *([-1] if curve else [])]
         place = np.unique(self.place, return_inverse=True)[1].reshape(-1)
-        return Design(columns, place, int(place.max()) + 1, weight=self.weight)
+        return Design(self.slopes[:, columns], place, int(place.max()) + 1, weight=self.weight)
 
 
 def judged(without: Callable[[Tone], Hues], wanted: str) -> tuple[Tone | None, Decision]:
     """The tone curve that the hues call for, or that is ``wanted`` (auto, on or off); and why.
+
+    Where light bounces they have to call for one beside a bounce of any strength, too, and plainly: what the
+    bounce lacks turns hues as well.
 
     Args:
         without: the hues, by the curve that is taken off.
@@ -56,32 +66,44 @@ def judged(without: Callable[[Tone], Hues], wanted: str) -> tuple[Tone | None, D
     if wanted == "off":
         return None, Decision("off", "forced off")
     began = time.perf_counter()
-    tone, verdict = steadied(Tone(), without), _verdict(without(Tone()))
-    took_s = round(time.perf_counter() - began, 3)
-    gain_db = round(verdict.gain_db, 3)
-    contrast = f"a contrast of {tone.contrast:.2f} predicts held-out hues better by {verdict}"
-    if wanted == "auto" and (abs(tone.contrast) < LEAST_CONTRAST or verdict.sigmas < MIN_SIGMAS):
-        return None, Decision("off", f"none that counts: {contrast}", gain_db, took_s)
+    trials = _trials(without)
+    tone, verdict = trials[0]
+    told = " and, beside a bounce of any strength, ".join(
+        f"a contrast of {curve.contrast:.2f} predicts held-out hues better by {each}"
+        for curve, each in trials
+    )
+    sure = verdict.sigmas >= MIN_SIGMAS and all(each.hints for _, each in trials[1:])
+    sure = sure and min(curve.contrast for curve, _ in trials) >= LEAST_CONTRAST
+    gain_db, took_s = round(verdict.gain_db, 3), round(time.perf_counter() - began, 3)
+    if wanted == "auto" and not sure:
+        return None, Decision("off", f"none that counts: {told}", gain_db, took_s)
     forced = "forced on; " if wanted == "on" else ""
-    return tone, Decision("on", forced + contrast, gain_db, took_s)
+    return tone, Decision("on", forced + told, gain_db, took_s)
 
 
-def steadied(tone: Tone, without: Callable[[Tone], Hues]) -> Tone:
+def _trials(without: Callable[[Tone], Hues]) -> list[tuple[Tone, Verdict]]:
+    """The curve and what it is worth; then, where light bounces, the same beside a bounce of any strength."""
+    plain = without(Tone())
+    passing = range(TISSUE, plain.slopes.shape[1])
+    return [(steadied(Tone(), without, each), _verdict(plain, each)) for each in passing]
+
+
+def steadied(tone: Tone, without: Callable[[Tone], Hues], passing: int = TISSUE) -> Tone:
     """The curve without which the hue of each place is steadiest, sought from ``tone``."""
     (contrast,) = Tone.parameters()
     for _ in range(ROUNDS):
         hues = without(tone)
         if len(hues.residual) < LEAST_SIGHTINGS:
             return tone
-        more = float(regress(hues.residual, hues.design()).coefficients[-1])
+        more = float(regress(hues.residual, hues.design(passing)).coefficients[-1])
         tone = Tone(float(np.clip(tone.contrast + more, contrast.low, contrast.high)))
     return tone
 
 
-def _verdict(hues: Hues) -> Verdict:
+def _verdict(hues: Hues, passing: int) -> Verdict:
     """How much better a curve predicts hues of places that did not choose it, to first order."""
     if len(hues.residual) < LEAST_SIGHTINGS:
         return Verdict(0.0, 0.0)
-    plain, bent = hues.design(curve=False), hues.design()
+    plain, bent = hues.design(passing, curve=False), hues.design(passing)
     half = (np.random.default_rng(0).random(plain.count) < 0.5)[plain.group]
     return compared(hues.residual, plain, bent, half, regress(hues.residual, plain).width)

@@ -81,6 +81,20 @@ class Cost:
     pixels: int
 
 
+Judged = tuple[Tone, Decision]
+
+
+@dataclass(frozen=True)
+class Found:
+    """The state, what it cost, and whether there are a coat and a tone curve; ``toned``: a new curve, beside
+    which effects, light and materials are to be found again."""
+
+    state: State
+    cost: Cost
+    decisions: dict[str, Decision]
+    toned: Judged | None
+
+
 @dataclass(frozen=True)
 class Best:
     """A ``state``, with the ``effects`` that were found with it, that costs least under its own light, by the
@@ -97,8 +111,7 @@ class LightStage:
 
     Args:
         samples: that tell the light. clipped: those that only say 'at least', to which a coat is held, too.
-        start: where to start, with a tone curve taken off the photos. wanted: auto, on or off, of coat and
-            tone.
+        wanted: auto, on or off, of coat and tone. toned: a tone curve that was found before, and why.
     """
 
     def __init__(
@@ -106,15 +119,17 @@ class LightStage:
         samples: Samples,
         clipped: Samples,
         surface: Surface,
-        start: Callable[[Tone | None], Start],
+        start: Start,
         pace: Pace,
         relighting: Relighting,
         wanted: Mapping[str, str],
         device: torch.device,
+        toned: Judged | None,
     ):
         self._clipped, self._surface, self._pace, self._wanted = clipped, surface, pace, wanted
-        self._relighting, self._start = relighting, start
-        self._decisions: dict[str, Decision] = {}
+        self._relighting, self._undetermined = relighting, start.undetermined
+        tone, decision = toned or (None, None)
+        self._decisions: dict[str, Decision] = {} if toned is None else {"tone": decision}
         self._unit_mm = unit_mm(surface)
         points, group = proxies(surface.vertices_mm, self._unit_mm * CELL_MM / PROXIES)
         began = pace.stopwatch.total
@@ -124,44 +139,31 @@ class LightStage:
         self._solver = GaussNewton(
             samples, triangles, operator, self._unit_mm, out_of_time=pace.light_is_over, device=device
         )
-        self._operator = operator
-        ready = self._begin(None)
+        self._state = _started(operator, start, relighting, tone)
+        relighting(self._solver, self._state)
+        ready = pace.stopwatch.total
+        self._state, _ = self._stepped(self._state, joint=False)
         step_s = pace.stopwatch.total - ready
         self._cost = Cost(ready - began, step_s, len(points) * len(operator.cells_mm), len(samples))
 
-    def found(self) -> tuple[State, Cost, dict[str, Decision]]:
-        """The state, what it cost, and whether there are a coat and a tone curve; where there is a curve,
-        light and materials are sought anew beside it."""
-        if (tone := self._search()) is not None:
-            self._begin(tone)
-            self._search()
+    def found(self) -> Found:
+        """What is found; where that is a tone curve, as soon as it is."""
+        toned = self._in_one_step() if self._relighting.bounces else None
+        if not self._relighting.bounces:
+            toned = self._in_turns()
         hurried = Decision("off", "no time to judge")
-        return self._state, self._cost, dict.fromkeys(self._wanted, hurried) | self._decisions
+        decisions = dict.fromkeys(self._wanted, hurried) | self._decisions
+        return Found(self._state, self._cost, decisions, toned)
 
-    def _begin(self, tone: Tone | None) -> float:
-        """Even tissue, and a step of the materials; the time when that step began, seconds."""
-        start = self._start(tone)
-        self._undetermined = start.undetermined
-        self._state = _started(self._operator, start, self._relighting, tone)
-        self._relighting(self._solver, self._state)
-        ready = self._pace.stopwatch.total
-        self._state, _ = self._stepped(self._state, joint=False)
-        return ready
-
-    def _search(self) -> Tone | None:
-        """Seek light and materials; a tone curve beside which to begin anew ends it early."""
-        tone = self._in_one_step() if self._relighting.bounces else None
-        return tone if self._relighting.bounces else self._in_turns()
-
-    def _in_turns(self) -> Tone | None:
+    def _in_turns(self) -> Judged | None:
         """Light by what varies within vertices, then the materials, then light again."""
         number = 0
         while number < STEPS:
             late = self._late
             if late and number:
                 break
-            if (tone := self._new_tone(number, COAT_STEP)) is not None:
-                return tone
+            if (toned := self._newly_toned(number, COAT_STEP)) is not None:
+                return toned
             shared = self._judged(number, COAT_STEP)
             within, material = self._within()
             found = within.renewed(material, shared, self._undetermined, self._noise, self._relighting.varied)
@@ -173,13 +175,13 @@ class LightStage:
             number = self._next(number, STEPS, gain, COAT_STEP)
         return None
 
-    def _in_one_step(self) -> Tone | None:
+    def _in_one_step(self) -> Judged | None:
         """Light and materials in one step, for the strength of the bounce; then light by what varies. Ends
         early where photos show no bounce."""
         number, best = 0, None
         while number < BOUNCE_STEPS and not self._late:
-            if (tone := self._new_tone(number, BOUNCE_COAT_STEP)) is not None:
-                return tone
+            if (toned := self._newly_toned(number, BOUNCE_COAT_STEP)) is not None:
+                return toned
             shared = self._judged(number, BOUNCE_COAT_STEP)
             scale = ("albedo scale",) * (number < HOLD_STEPS)
             self._solver.held = (*self._undetermined, *BOUNCE_HELD, *scale)
@@ -250,12 +252,12 @@ class LightStage:
             return number + 1
         return steps if len(self._decisions) == len(self._wanted) else max(number + 1, coat_step)
 
-    def _new_tone(self, number: int, step: int) -> Tone | None:
-        """A tone curve, if this is the ``step`` in which it is judged, and there is one."""
+    def _newly_toned(self, number: int, step: int) -> Judged | None:
+        """A tone curve and why, if this is the ``step`` in which it is judged, and there is one."""
         if number != step or "tone" in self._decisions:
             return None
         tone, self._decisions["tone"] = judged_tone(self._hues(), self._wanted["tone"])
-        return tone
+        return None if tone is None else (tone, self._decisions["tone"])
 
     def _judged(self, number: int, step: int) -> Globals:
         """Light and response as they are, with the tone curve that is right beside them, and the coat, which

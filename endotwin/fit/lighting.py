@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
+import scipy.sparse
 import torch
 from torch import Tensor
 
@@ -19,6 +20,7 @@ from endotwin.fit.normal_equations import Residual
 from endotwin.fit.within import Renewed, Varied
 from endotwin.light.bounced import GAMMA_STEP, Albedo, BouncedLight, Places
 from endotwin.light.guides import AT_LENS, COSINE, Guided, guided, log_axis, visible_from
+from endotwin.light.mirror import met_mirrored
 from endotwin.light.radiosity import Radiosity
 from endotwin.pixels.samples import Samples, Views
 from endotwin.surface import Surface
@@ -178,7 +180,8 @@ class Bouncer:
     """Interreflection of the training views, renewed from the albedo and the light that the fit has found."""
 
     def __init__(self, surface: Surface, caster: Caster, effects: Effects, views: Views):
-        self._surface = surface
+        self._surface, self._caster = surface, caster
+        self._placed: tuple[Tensor | None, Places | None] = None, None
         self._radiosity = Radiosity(surface, caster, effects["interreflection"].cell_mm)
         guides_mm = effects.guides_mm or AT_LENS
         self._light = BouncedLight(self._radiosity, views.T_local_camera, guides_mm, effects.profile)
@@ -191,8 +194,7 @@ class Bouncer:
         _, n, q = shared.log_light
         scale, lobes = shared.log_scale, shared.lobes.brighter(math.exp(shared.log_scale))
         albedo = Albedo.of(self._radiosity, materials[:, :3], materials[:, 3], lobes, triangles.numpy())
-        vertex = samples.nearest(self._surface.triangles)
-        places = Places(self._radiosity.to_vertex[vertex], samples.views.row(samples.frame))
+        places = self._places(samples, lobes.shine)
         gloss = lobes.gloss(samples.cos, roughness) * math.exp(-scale)
         steeper = materials[:, :3] ** (shared.gamma / (shared.gamma + GAMMA_STEP))
         other = Albedo.of(self._radiosity, steeper, materials[:, 3], lobes, triangles.numpy())
@@ -200,6 +202,34 @@ class Bouncer:
         bounce = self._light.expanded(places, n, q, albedo, gloss, scale, seen_by)
         shown = shared.gamma * torch.log(at_pixels(samples, triangles, materials[:, :3]))
         return replace(samples, bounce=replace(bounce, shown=shown))
+
+    def _places(self, samples: Samples, shine: bool) -> Places:
+        """Where the samples lie, and what they mirror if they ``shine``; kept for the steps that follow."""
+        if self._placed[0] is not samples.pixel:
+            to_vertex, triangles = self._radiosity.to_vertex, self._surface.triangles
+            view = samples.views.row(samples.frame)
+            mirrored = self._mirrored(samples, view) if shine else None
+            places = Places(to_vertex[samples.nearest(triangles)], view, mirrored)
+            self._placed = samples.pixel, places
+        return self._placed[1]
+
+    def _mirrored(self, samples: Samples, view: np.ndarray) -> scipy.sparse.csr_array:
+        """CSR [N, P], from patches to what each sample mirrors to its camera."""
+        surface, corner = self._surface, samples.barycentric.numpy()
+        triangles = surface.triangles[samples.triangle.numpy()]
+        points_mm, normals = (
+            np.einsum("nk,nka->na", corner, values[triangles]).astype(np.float32)
+            for values in (surface.vertices_mm, surface.normals)
+        )
+        eye_mm = samples.views.T_local_camera[view, :3, 3].astype(np.float32)
+        triangle, barycentric = met_mirrored(self._caster, points_mm, eye_mm, unit(normals))
+        met = triangle >= 0
+        nearest = surface.triangles[triangle[met], barycentric[met].argmax(axis=1)]
+        rows = self._radiosity.to_vertex[nearest]
+        counts = np.zeros(len(met), rows.indptr.dtype)
+        counts[met] = np.diff(rows.indptr)
+        pointers = np.concatenate([[0], np.cumsum(counts)])
+        return scipy.sparse.csr_array((rows.data, rows.indices, pointers), (len(met), rows.shape[1]))
 
 
 def regained(samples: Samples, material: Tensor, shared: Globals, effects: Effects, width: float) -> Effects:

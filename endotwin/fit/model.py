@@ -103,7 +103,8 @@ def _lit(samples: Samples, base_color: Tensor, shared: Globals) -> Lit:
     lit, bounce = samples.lit(*shared.bouncing), samples.bounce
     if bounce is None or bounce.shown is None:
         return lit
-    return replace(lit, irradiance=lit.irradiance * bounce.followed(torch.log(base_color), shared.gamma))
+    factor = bounce.followed(torch.log(base_color), shared.gamma)
+    return replace(lit, irradiance=lit.irradiance * factor, mirrored=lit.mirrored * factor)
 
 
 def predict(samples: Samples, material: Tensor, shared: Globals) -> Tensor:
@@ -176,8 +177,8 @@ def linearise(samples: Samples, material: Tensor, shared: Globals) -> Linearised
         distance = distance + given * share.log_distance[:, None]
     coat = None if lobes.coat is None else sum(share.coat for share in shares).detach()[:, None]
     if samples.bounce is not None:
-        bounced = forward.bounced(lit, log_light)
-        glow = bounced * (base_color + lit.gloss[:, None])
+        bounced, mirrored = forward.bounced(lit, log_light)
+        glow = bounced * base_color + mirrored * lit.gloss[:, None]
         x, per_color = x + glow, per_color + bounced
         axis = axis + glow * samples.bounce.by_n[:, None]
         distance = distance - glow * samples.bounce.by_q[:, None]

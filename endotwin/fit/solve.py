@@ -10,13 +10,13 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from endotwin.effects import Decision, Effect, Effects
-from endotwin.effects.tone import Tone
 from endotwin.errors import SequenceError
 from endotwin.evidence.decide import Decided, decide
 from endotwin.evidence.glints import Glints
@@ -24,7 +24,8 @@ from endotwin.fit.bloom import bloom
 from endotwin.fit.film import Found, Model
 from endotwin.fit.gauss_newton import CPU, GaussNewton, State, unusual
 from endotwin.fit.hashgrid import HashGrid, HashOperator
-from endotwin.fit.light_stage import Cost, LightStage
+from endotwin.fit.light_stage import Cost, Judged, LightStage
+from endotwin.fit.light_stage import Found as Lights
 from endotwin.fit.lighting import Relighting, lit
 from endotwin.fit.sparkle import sparkle
 from endotwin.fit.tilt import Tilter
@@ -82,51 +83,20 @@ def fit_twin(
             "check that poses and depth fit it"
         )
     with stopwatch.stage("start"):
-        smooth, clipped = _smooth(samples, surface), samples.color.amax(dim=1).numpy() >= BRIGHT
-        telling = np.flatnonzero(smooth & ~clipped)
-        if not len(telling):
-            telling = np.arange(len(samples))
-            if int(samples.color.amax(dim=1).min()) >= BRIGHT:
-                logger.warning(
-                    "no training photo of %s has an unclipped pixel: its light and materials are guesses",
-                    twin.source.path,
-                )
-        every = torch.from_numpy(telling)
-        telling = every[drawn(len(every), pace.start_pixels, np.random.default_rng(seed))]
-        start = closed_form(samples[telling], surface.triangles, len(surface.vertices_mm))
+        pixels = _Pixels.of(samples, twin, pace, seed)
+        start = closed_form(samples[pixels.start], surface.triangles, len(surface.vertices_mm))
     if start.undetermined:
         logger.warning("the photos cannot tell %s: kept at the prior", " and ".join(start.undetermined))
-    with stopwatch.stage("effects"):
-        caster = caster.threaded(THREADS)
-
-        def glints() -> Glints:
-            return Glints.of(samples[torch.from_numpy(smooth)], surface, start)
-
-        decided = decide(samples[every], twin, caster, glints, states, pace.light_is_over)
-        relighting = Relighting(surface, caster, decided.effects, samples.views)
-        shown = samples[telling]
-        samples = lit(samples, surface, caster, relighting.effects)
-    with stopwatch.stage("light"):
-        wanted = {name: states.get(name, "auto") for name in ("coat", "tone")}
-        if "specular" not in decided.effects:
-            wanted["coat"] = "off"
-        count = min(LIGHT_PIXELS, int(LIGHT_SHARE * pace.start_pixels))
-        rows = telling[torch.from_numpy(drawn(len(telling), count, np.random.default_rng(seed)))]
-        white = np.flatnonzero(smooth & clipped)
-        count = len(white) * len(rows) // len(every)
-        white = white[drawn(len(white), count, np.random.default_rng(seed))]
-        parts = samples[rows], samples[torch.from_numpy(white)]
-
-        def started(tone: Tone | None) -> Start:
-            """Where the fit starts with a tone curve taken off the photos."""
-            if tone is None and decided.light is None:
-                return start
-            return _start(shown if tone is None else shown.untoned(tone), surface, decided)
-
-        state, cost, judged = LightStage(*parts, surface, started, pace, relighting, wanted, device).found()
+    caster = caster.threaded(THREADS)
+    lighted = _find_light(pixels, twin, caster, start, pace, states, device)
+    if lighted.found.toned is not None:
+        lighted = _find_light(pixels, twin, caster, start, pace, states, device, lighted.found.toned)
+    relighting, samples, state = lighted.relighting, lighted.samples, lighted.found.state
     with stopwatch.stage("detail"):
         samples = relighting.guided(samples)
-        state, normals, left = _find_detail(samples, twin, state, cost, pace, relighting, device)
+        state, normals, left = _find_detail(
+            samples, twin, state, lighted.found.cost, pace, relighting, device
+        )
         twin = replace(twin, surface=replace(surface, normals=normals))
     wet, beyond, why = _beyond(Model(twin, state, relighting, caster), samples, states, pace)
     odd = unusual(state.shared)
@@ -137,8 +107,8 @@ def fit_twin(
             *(" and ".join(odd), twin.source.path),
         )
     with stopwatch.stage("price"):
-        decisions = {**decided.decisions, **judged, **why}
-        if "interreflection" in decided.effects and not relighting.bounces:
+        decisions = {**lighted.decided.decisions, **lighted.found.decisions, **why}
+        if "interreflection" in lighted.decided.effects and not relighting.bounces:
             decisions["interreflection"] = _without_bounce(decisions["interreflection"])
         if left is not None and (said := residual_warning(left, twin.sequence(), decisions)):
             logger.warning("%s; 'endotwin check %s' looks for the cause", said, twin.source.path)
@@ -151,12 +121,90 @@ def fit_twin(
     )
 
 
-def _start(samples: Samples, surface: Surface, decided: Decided) -> Start:
-    """Where the fit starts under the light that was decided."""
+@dataclass(frozen=True)
+class _Pixels:
+    """Training samples, and which of them say what.
+
+    Attributes:
+        smooth: bool [N], off the creases of the surface. telling: rows int64 of those that tell the light:
+            smooth, and not clipped. start: of these, that the fit starts from. light: of these, by which the
+            light is found. white: smooth ones that are clipped, to go with those.
+    """
+
+    samples: Samples
+    smooth: Tensor
+    telling: Tensor
+    start: Tensor
+    light: Tensor
+    white: Tensor
+
+    @classmethod
+    def of(cls, samples: Samples, twin: Twin, pace: Pace, seed: int) -> _Pixels:
+        smooth, clipped = _smooth(samples, twin.surface), samples.color.amax(dim=1).numpy() >= BRIGHT
+        telling = np.flatnonzero(smooth & ~clipped)
+        if not len(telling):
+            telling = np.arange(len(samples))
+            if int(samples.color.amax(dim=1).min()) >= BRIGHT:
+                logger.warning(
+                    "no training photo of %s has an unclipped pixel: its light and materials are guesses",
+                    twin.source.path,
+                )
+
+        def some(rows: np.ndarray, count: int) -> np.ndarray:
+            return rows[drawn(len(rows), count, np.random.default_rng(seed))]
+
+        start = some(telling, pace.start_pixels)
+        light = some(start, min(LIGHT_PIXELS, int(LIGHT_SHARE * pace.start_pixels)))
+        white = np.flatnonzero(smooth & clipped)
+        white = some(white, len(white) * len(light) // len(telling))
+        return cls(samples, *map(torch.from_numpy, (smooth, telling, start, light, white)))
+
+
+@dataclass(frozen=True)
+class _Lighted:
+    """The effects that are decided, what they make of the light, the training samples under it, and what is
+    found beside it."""
+
+    decided: Decided
+    relighting: Relighting
+    samples: Samples
+    found: Lights
+
+
+def _find_light(
+    pixels: _Pixels,
+    twin: Twin,
+    caster: Caster,
+    start: Start,
+    pace: Pace,
+    states: Mapping[str, str],
+    device: torch.device,
+    toned: Judged | None = None,
+) -> _Lighted:
+    """The effects that the photos show, without a tone curve that was found before, and light, response and
+    coarse materials beside them; ``start`` is that of photos as they are."""
+    samples, surface = pixels.samples, twin.surface
+    shown = samples if toned is None else samples.untoned(toned[0])
     mesh = surface.triangles, len(surface.vertices_mm)
-    if decided.light is None:
-        return closed_form(samples, *mesh)
-    return start_at(samples, *mesh, decided.light, decided.gamma)
+    with pace.stopwatch.stage("effects"):
+
+        def glints() -> Glints:
+            return Glints.of(shown[pixels.smooth], surface, start)
+
+        decided = decide(shown[pixels.telling], twin, caster, glints, states, pace.light_is_over)
+        relighting = Relighting(surface, caster, decided.effects, samples.views)
+        if decided.light is not None:
+            start = start_at(shown[pixels.start], *mesh, decided.light, decided.gamma)
+        elif toned is not None:
+            start = closed_form(shown[pixels.start], *mesh)
+        samples = lit(samples, surface, caster, relighting.effects)
+    with pace.stopwatch.stage("light"):
+        wanted = {name: states.get(name, "auto") for name in ("coat", "tone")}
+        if "specular" not in decided.effects:
+            wanted["coat"] = "off"
+        parts = samples[pixels.light], samples[pixels.white]
+        stage = LightStage(*parts, surface, start, pace, relighting, wanted, device, toned)
+        return _Lighted(decided, relighting, samples, stage.found())
 
 
 def _beyond(

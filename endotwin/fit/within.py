@@ -36,12 +36,14 @@ from endotwin.fit.gauss_newton import (
     global_prior,
     roughness_slope,
 )
-from endotwin.fit.model import Globals, linearise, predict
+from endotwin.fit.model import BOUNCE_GLOBALS, Globals, linearise, predict
 from endotwin.light import shading
 from endotwin.pixels.fixed_effects import Design, regress
 from endotwin.pixels.samples import Samples
 from endotwin.pixels.start import BRIGHT, DARK, DIFFUSE_SIN2
 from endotwin.surface import Surface
+
+SCALE = BOUNCE_GLOBALS.index("ln albedo scale")
 
 DARKEST = 0.03
 """Display value of the prediction below which noise rules the logarithm."""
@@ -207,12 +209,14 @@ class Within:
         rows, predicted = rows[bright], model.predicted[bright].double()
         shown = self.samples.color[rows].double().numpy() / 255
         by_raw = roughness_slope(material[rows, 3])[:, None]
-        by_tissue = model.by_globals[bright][..., F0], model.by_roughness[bright] * by_raw
+        passing = [model.by_globals[bright][..., F0], model.by_roughness[bright] * by_raw]
+        if shared.bounces:
+            passing.append(model.by_globals[bright][..., SCALE])
 
         def without(tone: Tone) -> Hues:
             steep, found = predicted * tone.slope(predicted), []
             untoned = torch.log(torch.from_numpy(tone.undone(shown)) / predicted)
-            relative = [untoned, *(x / predicted for x in by_tissue), bend(predicted) / steep]
+            relative = [untoned, *(x / predicted for x in passing), bend(predicted) / steep]
             for number, ratio in enumerate(RATIOS):
                 variance = (noise / steep) ** 2 @ ratio**2 + RATIO_ERROR**2
                 columns = tuple((x @ ratio).numpy() for x in relative)

@@ -68,27 +68,45 @@ class Places:
     Attributes:
         weights: CSR [N, P], interpolation from patches (``Radiosity.to_points``).
         view: int [N], in which view each point is seen.
+        mirrored: CSR [N, P], to what each mirrors to that view's camera, where it does not mirror what nobody
+            saw; None: light comes from all around alike.
     """
 
     weights: scipy.sparse.csr_array
     view: np.ndarray
+    mirrored: scipy.sparse.csr_array | None = None
 
     def of(self, per_patch: np.ndarray) -> np.ndarray:
         """Values [P, M, C] of patches in M views at the points, [N, C]."""
-        if per_patch.shape[1] == 1:
-            return self.weights @ per_patch[:, 0]
-        by_view = np.swapaxes(per_patch, 0, 1).reshape(-1, per_patch.shape[2])
-        return self._from_views @ by_view[: self._from_views.shape[1]]
+        return self._from_views @ _by_view(per_patch, self._from_views)
+
+    def contrast(self, leaving: np.ndarray, arriving: np.ndarray) -> np.ndarray:
+        """Radiosity of what the points mirror, of that of patches [P, M, 3], over what is ``arriving`` [N, 3]
+        at them; 1 where they mirror what nobody saw."""
+        met = np.diff(self.mirrored.indptr) > 0
+        mirrored = self._mirrored_from_views @ _by_view(leaving, self._mirrored_from_views)
+        return np.where(met[:, None], mirrored / arriving, 1).astype(np.float32)
 
     @cached_property
     def _from_views(self) -> scipy.sparse.csr_array:
-        """CSR [N, M·P], from patches in each view, for M views that see any."""
-        weights, patches = self.weights, self.weights.shape[1]
-        view = np.repeat(self.view.astype(np.int32), np.diff(weights.indptr))
-        shape = (len(self.view), (int(self.view.max(initial=0)) + 1) * patches)
-        return scipy.sparse.csr_array(
-            (weights.data, patches * view + weights.indices, weights.indptr), shape=shape
-        )
+        return _in_views(self.weights, self.view)
+
+    @cached_property
+    def _mirrored_from_views(self) -> scipy.sparse.csr_array:
+        return _in_views(self.mirrored, self.view)
+
+
+def _in_views(weights: scipy.sparse.csr_array, view: np.ndarray) -> scipy.sparse.csr_array:
+    """CSR [N, M·P], from patches in each of M views, by ``weights`` [N, P] of points in the ``view`` [N]."""
+    patches = weights.shape[1]
+    views = np.repeat(view.astype(np.int32), np.diff(weights.indptr))
+    shape = len(view), (int(view.max(initial=0)) + 1) * patches
+    return scipy.sparse.csr_array((weights.data, patches * views + weights.indices, weights.indptr), shape)
+
+
+def _by_view(per_patch: np.ndarray, from_views: scipy.sparse.csr_array) -> np.ndarray:
+    """Values [P, M, C] as ``from_views`` takes them, [M·P, C]."""
+    return np.swapaxes(per_patch, 0, 1).reshape(-1, per_patch.shape[2])[: from_views.shape[1]]
 
 
 @dataclass(frozen=True)
@@ -98,7 +116,8 @@ class Bounce(Rows):
 
     Attributes:
         log, by_scale, by_gamma: float32 [N, 3]. by_n, by_q: float32 [N], the channels' mean.
-        gloss: float32 [N], share of it that the white lobes send to the camera.
+        gloss: float32 [N], share of what the points mirror that their white lobes send to the camera.
+        contrast: float32 [N, 3], radiosity of that over E; None: 1.
         shown: float32 [N, 3], γ·ln of the points' base colours that throw it; None: it follows no colours.
     """
 
@@ -108,6 +127,7 @@ class Bounce(Rows):
     by_scale: Tensor
     by_gamma: Tensor
     gloss: Tensor
+    contrast: Tensor | None = None
     shown: Tensor | None = None
 
     def to(self, device: torch.device) -> Bounce:
@@ -121,6 +141,10 @@ class Bounce(Rows):
     def log_irradiance(self, n: float, q: float, log_scale: float = 0.0, gamma: float = 0.0) -> Tensor:
         by_light = (n * self.by_n + q * self.by_q)[:, None]
         return self.log + by_light + log_scale * self.by_scale + gamma * self.by_gamma
+
+    def mirrored(self, irradiance: Tensor) -> Tensor:
+        """Radiosity [N, 3] of what the points mirror to their cameras, where this is their E [N, 3]."""
+        return irradiance if self.contrast is None else irradiance * self.contrast
 
     @property
     def following(self) -> Tensor:
@@ -152,9 +176,15 @@ class BouncedLight:
 
     def at(self, places: Places, n: float, q: float, albedo: Albedo) -> np.ndarray:
         """Irradiance float32 [N, 3] with L0 = 1 and patches of ``albedo``."""
+        return places.of(self.between(n, q, albedo)[0])
+
+    def between(self, n: float, q: float, albedo: Albedo) -> tuple[np.ndarray, np.ndarray]:
+        """Indirect irradiance and radiosity of patches of ``albedo``, float32 [P, M, 3], with L0 = 1."""
         direct = np.stack([self._radiosity.direct(lamps, n, q).mean(axis=1) for lamps in self._lamps], axis=1)
         mirrors = self._mirrors if albedo.glossy.any() else ()
-        return places.of(self._radiosity.indirect(direct, albedo.base_color, albedo.glossy, mirrors))
+        arriving = self._radiosity.indirect(direct, albedo.base_color, albedo.glossy, mirrors)
+        sent = (albedo.base_color + albedo.glossy)[:, None].astype(np.float32)
+        return arriving, sent * (direct[: len(arriving), :, None] + arriving)
 
     @cached_property
     def _mirrors(self) -> list[scipy.sparse.csr_array]:
@@ -181,7 +211,9 @@ class BouncedLight:
         def log_irradiance(n: float, q: float, log_scale: float, albedo: Albedo = albedo) -> np.ndarray:
             return np.log(np.maximum(self.at(places, n, q, albedo.scaled(log_scale)), DARKEST))
 
-        here = log_irradiance(n, q, log_scale)
+        arriving, leaving = self.between(n, q, albedo.scaled(log_scale))
+        irradiance = np.maximum(places.of(arriving), DARKEST)
+        here = np.log(irradiance)
         moved = (
             (n + LIGHT_STEP, q, log_scale),
             (n, q + LIGHT_STEP, log_scale),
@@ -198,4 +230,5 @@ class BouncedLight:
             torch.from_numpy(np.ascontiguousarray(x, np.float32))
             for x in (level, by_n, by_q, by_scale, by_gamma)
         ]
-        return Bounce(*columns, gloss)
+        contrast = None if places.mirrored is None else torch.from_numpy(places.contrast(leaving, irradiance))
+        return Bounce(*columns, gloss, contrast)

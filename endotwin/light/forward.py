@@ -1,8 +1,9 @@
 """The radiance of a surface point: the one place where it is written, for the renderer and for the fit.
 
-x = Σ_k g_k·(D_k·b/π + f0·S_k + w·f0_water·S'_k) + 2·L0·E·(b + ρ), with g = 2π·L·(n·ωi) of each light guide, D
+x = Σ_k g_k·(D_k·b/π + f0·S_k + w·f0_water·S'_k) + 2·L0·(E·b + B·ρ), with g = 2π·L·(n·ωi) of each guide, D
 the diffuse factor, S the specular lobe of the tissue and S' that of a coat of weight w, E what other tissue
-throws on the point for L0 = 1, and ρ the white lobes' share of that. Han & Wu 2025 with one guide at the
+throws on the point for L0 = 1, B the radiosity of what the point mirrors to the camera, and ρ the white
+lobes' share of that. Han & Wu 2025 with one guide at the
 lens, no coat and no E; Burley's diffuse lobe unless D is 1. It is linear in the base colour b, and in what
 each guide gives exponential in n and q: the derivatives by those follow from the same pieces.
 """
@@ -31,13 +32,15 @@ class Lit:
         cos_o: [N], n·wo. guides: how each of K guides lights them.
         log_exposure: [N], ln of what camera and lens make of all light; None: 0.
         irradiance: [N, 3], what other tissue throws on them for L0 = 1; None: nothing.
-        gloss: [N], share of that irradiance which the white lobes send to the camera.
+        mirrored: [N, 3], radiosity of the tissue that they mirror to the camera, for L0 = 1.
+        gloss: [N], share of light from there that the white lobes send on.
     """
 
     cos_o: Tensor
     guides: Guided
     log_exposure: Tensor | None = None
     irradiance: Tensor | None = None
+    mirrored: Tensor | None = None
     gloss: Tensor | None = None
 
     @classmethod
@@ -60,6 +63,11 @@ class Lobes:
     f0: float
     burley: bool = True
     coat: tuple[float, float, float] | None = None
+
+    @property
+    def shine(self) -> bool:
+        """Whether there is a white lobe."""
+        return self.f0 > 0 or self.coat is not None
 
     def brighter(self, factor: float) -> Lobes:
         """The same with white lobes brighter by ``factor``."""
@@ -132,12 +140,14 @@ def shares(lit: Lit, log_light: LogLight, roughness: Tensor, lobes: Lobes) -> li
     return found
 
 
-def bounced(lit: Lit, log_light: LogLight) -> Tensor:
-    """2·L0·E of points on which other tissue throws light, [N, 3]: what a base colour of 1 makes of it."""
+def bounced(lit: Lit, log_light: LogLight) -> tuple[Tensor, Tensor]:
+    """Of points on which other tissue throws light, 2·L0·E, what a base colour of 1 makes of it, and 2·L0·B,
+    what white lobes that send on all of it do; each [N, 3]."""
     log_factor = torch.as_tensor(log_light[0], dtype=lit.irradiance.dtype)
     if lit.log_exposure is not None:
         log_factor = (log_factor + lit.log_exposure)[:, None]
-    return lit.irradiance * (2 * torch.exp(log_factor))
+    factor = 2 * torch.exp(log_factor)
+    return lit.irradiance * factor, lit.mirrored * factor
 
 
 def radiance(lit: Lit, log_light: LogLight, base_color: Tensor, roughness: Tensor, lobes: Lobes) -> Tensor:
@@ -149,4 +159,5 @@ def radiance(lit: Lit, log_light: LogLight, base_color: Tensor, roughness: Tenso
         x = x + sum(share.white(lobes) for share in found)[:, None]
     if lit.irradiance is None:
         return x
-    return x + bounced(lit, log_light) * (base_color + lit.gloss[:, None])
+    per_color, mirrored = bounced(lit, log_light)
+    return x + per_color * base_color + mirrored * lit.gloss[:, None]

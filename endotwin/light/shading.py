@@ -12,10 +12,12 @@ of logarithms.
 from __future__ import annotations
 
 import math
+from functools import cache
 
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn.functional import grid_sample
 
 F0_DIELECTRIC = 0.04
 """Reflectance of tissue at normal incidence: ((1.5 - 1) / (1.5 + 1))², Burley's ``specular`` 0.5."""
@@ -28,6 +30,9 @@ ROUGHNESS_TISSUE = 0.4
 
 ROUGHNESS_MIN = 0.045
 """Least roughness: α = r² = 0.002 keeps the GGX peak 1/(π α²) and its slope within float32."""
+
+NODES = 33
+"""Of the table of what a lobe does with light from all around."""
 
 RADIANCE_MIN = 1e-6
 """Least radiance that the response sees; x^γ has infinite slope at 0. In display values 1e-6^(1/2.2) is half
@@ -137,14 +142,31 @@ def specular_colocated(cos: Tensor, sin2: Tensor, roughness: Tensor) -> Tensor:
 
 
 def specular_of_even_light(cos_o: Tensor, roughness: Tensor, f0: float) -> Tensor:
-    """Share of light from all around that the white GGX lobe sends to the camera, [N]: Karis 2014
-    ("Physically Based Shading on Mobile"), a fit to Lazarov's table: within 0.01 of the integral for cos
-    above 0.5, within 0.05 at 0.2."""
-    first = 1 - roughness
-    grazing = torch.minimum(first * first, torch.exp2(-9.28 * cos_o)) * first + 0.0425 - 0.0275 * roughness
-    scale = -1.04 * grazing + 1.04 - 0.572 * roughness
-    bias = 1.04 * grazing - 0.04 + 0.022 * roughness
-    return f0 * scale + bias
+    """Share of light from all around that the white GGX lobe sends to the camera, [N]: f0·A + B, from a table
+    of both (Karis 2013, "Real Shading in Unreal Engine 4"), within 0.005 of the integral."""
+    cos_o, roughness = torch.broadcast_tensors(cos_o, roughness)
+    place = 2 * torch.stack([cos_o.reshape(-1), roughness.reshape(-1)], dim=-1) - 1
+    table = _even_light().to(place)
+    found = grid_sample(table, place[None, None], padding_mode="border", align_corners=True)
+    scale, bias = found[0, :, 0]
+    return (f0 * scale + bias).reshape(cos_o.shape)
+
+
+@cache
+def _even_light() -> Tensor:
+    """A and B, float64 [1, 2, NODES, NODES] over roughness and n·wo, each even in 0 … 1: the mean over facets
+    of density D(m)·(n·m) of what they mirror (Walter et al. 2007, eqs. 35, 36 and 41)."""
+    nodes = torch.linspace(0, 1, NODES, dtype=torch.float64)
+    middle = (torch.arange(NODES, dtype=torch.float64) + 0.5) / NODES
+    roughness, cos_o, u, turn = torch.meshgrid(nodes, nodes, middle, 2 * math.pi * middle, indexing="ij")
+    alpha = roughness.clamp_min(ROUGHNESS_MIN) ** 2
+    cos_m = torch.sqrt((1 - u) / (1 + (alpha * alpha - 1) * u))
+    aside = torch.sqrt((1 - cos_o * cos_o) * (1 - cos_m * cos_m))
+    facing = (cos_o * cos_m + aside * torch.cos(turn)).clamp_min(0)
+    cos_i = (2 * facing * cos_m - cos_o).clamp_min(0)
+    sent = 4 * cos_i * facing * smith_visibility(cos_i, cos_o, alpha) / cos_m
+    grazing = sent * schlick(facing, 0.0)
+    return torch.stack([(sent - grazing).mean(dim=(2, 3)), grazing.mean(dim=(2, 3))])[None]
 
 
 def respond(radiance: Tensor, gamma: float | Tensor) -> Tensor:

@@ -140,7 +140,8 @@ class Samples:
         more = {"log_exposure": self.log_exposure}
         if self.bounce is not None:
             irradiance = self.bounce.irradiance(n, q, log_scale, gamma)
-            more |= {"irradiance": irradiance, "gloss": self.bounce.gloss}
+            mirrored = self.bounce.mirrored(irradiance)
+            more |= {"irradiance": irradiance, "mirrored": mirrored, "gloss": self.bounce.gloss}
         if self.guides is not None:
             return Lit(self.cos, self.guides, **more)
         return Lit.at_lens(self.cos, self.sin2, self.log_cos_axis, self.log_distance, **more)

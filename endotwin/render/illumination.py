@@ -11,11 +11,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from endotwin.light.bounced import Albedo, BouncedLight, Places
+from endotwin.light.bounced import Albedo, BouncedLight
 from endotwin.light.film import film_in_view
 from endotwin.light.forward import Lit, Lobes, radiance
 from endotwin.light.guides import AT_LENS, COSINE, guided, lamps_mm, log_axis, visible_from
 from endotwin.light.incidence import COS_MIN, incidence_on
+from endotwin.light.mirror import met_mirrored
 from endotwin.light.radiosity import Radiosity
 from endotwin.surface.casting import Caster, Correspondences
 from endotwin.surface.vectors import dot
@@ -61,10 +62,10 @@ class Illumination:
     def at(self, T_world_camera: np.ndarray) -> ViewLight:
         """The light of the view from ``T_world_camera`` [4, 4]."""
         T_local_camera = self.twin.surface.to_local(T_world_camera)
-        irradiance = None if self._albedo is None else self._bounced(T_local_camera)
-        return ViewLight(self.twin, self._caster, T_local_camera, irradiance, self._mirrored(T_local_camera))
+        bounced = None if self._albedo is None else self._bounced(T_local_camera)
+        return ViewLight(self.twin, self._caster, T_local_camera, bounced, self._film(T_local_camera))
 
-    def _mirrored(self, T_local_camera: np.ndarray) -> np.ndarray | None:
+    def _film(self, T_local_camera: np.ndarray) -> np.ndarray | None:
         """Radiance that the film at each vertex sends to the camera, float32 [V]; None without a film."""
         twin, effects, film = self.twin, self.twin.effects, self.twin.film
         if film is None:
@@ -81,12 +82,12 @@ class Illumination:
         )
 
     def _bounced(self, T_local_camera: np.ndarray) -> np.ndarray:
-        """Indirect irradiance of the vertices, float32 [V, 3], with L0 = 1."""
+        """Indirect irradiance of the vertices and their radiosity, float32 [V, 6], with L0 = 1."""
         light, effects, to_vertex = self.twin.light, self.twin.effects, self._radiosity.to_vertex
         guides_mm = effects.guides_mm or AT_LENS
         bounced = BouncedLight(self._radiosity, T_local_camera[None], guides_mm, effects.profile)
-        places = Places(to_vertex, np.zeros(to_vertex.shape[0], np.int32))
-        return effects.bounce * bounced.at(places, light.n, light.q, self._albedo)
+        both = np.concatenate(bounced.between(light.n, light.q, self._albedo), axis=2)
+        return np.float32(effects.bounce) * (to_vertex @ both[:, 0])
 
 
 @dataclass(frozen=True)
@@ -95,14 +96,15 @@ class ViewLight:
 
     Attributes:
         T_local_camera: the pose in the surface's frame, float64 [4, 4].
-        irradiance: what other tissue throws on each vertex, float32 [V, 3], with L0 = 1; None: nothing.
+        bounced: indirect irradiance and radiosity of each vertex, float32 [V, 6], with L0 = 1; None: no light
+            bounces.
         film: radiance that the film at each vertex sends to the camera, float32 [V]; None: nothing.
     """
 
     twin: Twin
     caster: Caster
     T_local_camera: np.ndarray
-    irradiance: np.ndarray | None
+    bounced: np.ndarray | None
     film: np.ndarray | None
 
     def lit(
@@ -133,14 +135,33 @@ class ViewLight:
         cos_o = np.clip(-dot(normals, view), COS_MIN, 1)
         return Lit(torch.from_numpy(cos_o), guides), visible
 
-    def radiance(self, hits: Correspondences, lit: Lit, material: Tensor) -> Tensor:
-        """Radiance of hits, float32 [N, 3], that the guides light so; ``material``: base colour, roughness
-        and metallic of the hits, [N, 5]."""
+    def mirrored(self, hits: Correspondences, normals: np.ndarray) -> Correspondences | None:
+        """What the hits, with ``normals`` [N, 3] in the camera frame, mirror to the camera, where that was
+        seen; its pixels are rows of the hits. None where no light bounces, or nothing mirrors it."""
+        if self.bounced is None or not _lobes(self.twin).shine:
+            return None
+        surface, pose = self.caster.surface, self.T_local_camera.astype(np.float32)
+        points_mm = hits.interpolate(surface, surface.vertices_mm)
+        eye_mm = np.broadcast_to(pose[:3, 3], points_mm.shape)
+        triangle, barycentric = met_mirrored(self.caster, points_mm, eye_mm, normals @ pose[:3, :3].T)
+        met = np.flatnonzero(triangle >= 0)
+        return Correspondences(met, triangle[met], barycentric[met], hits.distance_mm[met])
+
+    def radiance(
+        self, hits: Correspondences, lit: Lit, material: Tensor, mirrored: Correspondences | None
+    ) -> Tensor:
+        """Radiance of hits, float32 [N, 3], that the guides light so, and that show what is ``mirrored``;
+        ``material``: base colour, roughness and metallic of the hits, [N, 5]."""
         twin, roughness = self.twin, material[:, 3]
-        if self.irradiance is not None:
+        if self.bounced is not None:
             gloss = _lobes(twin).gloss(lit.cos_o.clamp(max=1), roughness)
-            bounced = torch.from_numpy(hits.interpolate(twin.surface, self.irradiance))
-            lit = replace(lit, irradiance=bounced, gloss=gloss)
+            irradiance = hits.interpolate(twin.surface, self.bounced[:, :3])
+            shown = irradiance.copy()
+            if mirrored is not None:
+                shown[mirrored.pixel] = mirrored.interpolate(twin.surface, self.bounced[:, 3:])
+            lit = replace(
+                lit, irradiance=torch.from_numpy(irradiance), mirrored=torch.from_numpy(shown), gloss=gloss
+            )
         base_color = material[:, :3] * (1 - material[:, 4:])
         x = radiance(lit, log_light(twin), base_color, roughness, _lobes(twin))
         if self.film is not None:
