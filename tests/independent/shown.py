@@ -7,7 +7,8 @@ of the scene's other effects. The light's profile and the lens's vignetting are 
 show beside the other. What remains is what the effect shows, as root mean square. The light that bounces
 stays as it is while guides and profile change.
 
-A tone curve is judged on the photos' values, all else on what they are without one.
+A tone curve is judged on the photos' values, channel by channel, since it turns hues; all else on grey ones
+as they are without a curve.
 
 In the same way, what a wrong γ, n or q shows is what is left of its change after the best fit of all else:
 the smaller, the more does a small fault of a model bend it.
@@ -41,9 +42,10 @@ DARKEST = 1e-4
 def shown_levels(studio: Studio) -> dict[str, dict[str, float]]:
     """Of each effect of the studio's scene: ``levels`` of 255 that it shows, and ``db`` by which a perfect
     model without it would lie above the photos' noise."""
-    scene, pixels = studio.scene, Pixels(studio)
+    scene, grey, colored = studio.scene, Pixels(studio), Pixels(studio, channels=3)
     found = {}
     for name in sorted(scene.effects):
+        pixels = colored if name == "tone" else grey
         present = scene.effects if name == "tone" else scene.effects - {"tone"}
         lacking = scene.having(present).without(name).effects
         x = pixels.radiance(lacking)
@@ -72,9 +74,11 @@ def wrong_levels(studio: Studio) -> dict[str, float]:
 
 @dataclass(frozen=True)
 class Pixels:
-    """Some pixels of all frames of a studio's scene, grey."""
+    """Some pixels of all frames of a studio's scene, grey; or their 3 ``channels``, one after the other, that
+    share everything but albedo."""
 
     studio: Studio
+    channels: int = 1
 
     @cached_property
     def _views(self) -> list[View]:
@@ -86,8 +90,8 @@ class Pixels:
     def radiance(self, effects: frozenset[str]) -> np.ndarray:
         """Radiance [N] as if the scene had these of its effects."""
         scene = self.studio.scene.having(effects)
-        parts = [self.studio.radiance(view, scene).mean(axis=1) for view in self._views]
-        return np.maximum(np.concatenate(parts), DARKEST).astype(np.float64)
+        x = np.concatenate([self.studio.radiance(view, scene) for view in self._views]).astype(np.float64)
+        return np.maximum(x.mean(axis=1) if self.channels == 1 else x.T.ravel(), DARKEST)
 
     def unclipped(self, value: np.ndarray) -> np.ndarray:
         """Display values [N] where they answer to radiance: 0 where they are clipped."""
@@ -105,13 +109,15 @@ class Pixels:
 
     @cached_property
     def _points_mm(self) -> np.ndarray:
-        return np.concatenate([view.points_mm for view in self._views]).astype(np.float64)
+        points_mm = np.concatenate([view.points_mm for view in self._views]).astype(np.float64)
+        return np.tile(points_mm, (self.channels, 1))
 
     @cached_property
     def cell(self) -> np.ndarray:
-        """Number of the cell of the wall that each pixel [N] sees."""
+        """Number of the cell of the wall that each pixel [N] sees, others for each channel."""
         row, column = np.floor(np.concatenate([view.place for view in self._views]) / CELL).astype(np.int64).T
-        return np.unique(row * 65536 + column, return_inverse=True)[1].reshape(-1)
+        cell = np.unique(row * 65536 + column, return_inverse=True)[1].reshape(-1)
+        return np.concatenate([cell + channel * (cell.max() + 1) for channel in range(self.channels)])
 
     def taken_up(self, effects: set[str]) -> list[np.ndarray]:
         """What the parameters of effects do to the logarithm of radiance: columns [N]."""
@@ -119,10 +125,11 @@ class Pixels:
         if "profile" in effects:
             columns.append(np.exp(self.log_axis))
         if "vignetting" in effects:
-            r2 = np.concatenate([view.squared_radius for view in self._views])
+            r2 = np.tile(np.concatenate([view.squared_radius for view in self._views]), self.channels)
             columns += [r2, r2 * r2]
         if "gain" in effects:
             frame = np.concatenate([np.full(len(view.ray), view.frame) for view in self._views])
+            frame = np.tile(frame, self.channels)
             columns += [(frame == number).astype(float) for number in range(1, len(self._views))]
         return columns
 

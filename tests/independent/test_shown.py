@@ -58,3 +58,16 @@ def test_a_gain_of_each_frame_makes_q_harder_to_tell(scene: Scene) -> None:
     plain = wrong_levels(Studio(scene))
     gained = wrong_levels(Studio(scene.having(frozenset({"gain"}))))
     assert gained["q"] < 0.8 * plain["q"]
+
+
+@pytest.mark.slow
+def test_a_tone_curve_shows_in_hues_more_than_in_brightness(scene: Scene) -> None:
+    """Red and blue of a place lie at different places of the curve; and twice the contrast shows twice."""
+    toned = replace(scene, tone=0.2).having(frozenset({"tone"}))
+    levels = shown_levels(Studio(toned))["tone"]["levels"]
+    more = shown_levels(Studio(replace(toned, tone=0.4)))["tone"]["levels"]
+    assert more == pytest.approx(2 * levels, rel=0.15)
+    grey = Pixels(Studio(toned))
+    x = grey.radiance(frozenset())
+    plain, columns = displayed(x, scene), [np.log(x), grey.log_axis, grey.log_distance]
+    assert levels > 1.2 * grey.left(displayed(x, toned) - plain, plain, columns)
