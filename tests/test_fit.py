@@ -2,6 +2,8 @@
 
 import json
 import logging
+import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -12,6 +14,7 @@ import tube_sequence
 
 import endotwin
 from endotwin.config import FitConfig
+from endotwin.effects.tone import Tone
 from endotwin.evaluation.evaluation import covered_pixels
 from endotwin.fit import fit
 from endotwin.fit.light_stage import proxies
@@ -88,6 +91,20 @@ def test_base_color_of_the_example_is_the_painted_albedo_up_to_one_scale(colon, 
 
 def test_the_example_predicts_photos_that_it_never_saw(colon):
     assert endotwin.evaluate(colon).psnr_covered > 33
+
+
+def test_a_tone_curve_over_the_example_is_found_and_leaves_the_response(fused, example, tmp_path):
+    """Beside the light alone γ would be a twelfth too large."""
+    toned, curve = tmp_path / "toned", Tone(0.3)
+    shutil.copytree(example, toned)
+    levels = np.rint(255 * curve.shown(torch.linspace(0, 1, 256)).numpy()).astype(np.uint8)
+    for file in toned.glob("*_color.png"):
+        cv2.imwrite(str(file), levels[cv2.imread(str(file))])
+    bare = fused(0.5)
+    bare = replace(bare, source=replace(bare.source, path=str(toned)))
+    twin = endotwin.fit_twin(bare)
+    assert twin.effects["tone"].contrast == pytest.approx(curve.contrast, abs=0.06)
+    assert twin.response.gamma == pytest.approx(made(example)["gamma"], rel=0.03)
 
 
 def test_interreflection_that_no_photo_shows_is_fitted_away(colon):

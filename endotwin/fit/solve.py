@@ -117,7 +117,7 @@ def fit_twin(
             effects = effects.including(effect)
         fitted = price(_fitted(twin, wet.model.state, effects, decisions, wet.film), caster, samples.views)
     return fitted.with_record(
-        fit={"method": "twin", "undetermined": list(start.undetermined), **stopwatch.to_dict()}
+        fit={"method": "twin", "undetermined": list(lighted.start.undetermined), **stopwatch.to_dict()}
     )
 
 
@@ -162,10 +162,11 @@ class _Pixels:
 
 @dataclass(frozen=True)
 class _Lighted:
-    """The effects that are decided, what they make of the light, the training samples under it, and what is
-    found beside it."""
+    """The effects that are decided, where the fit started beside them, what they make of the light, the
+    training samples under it, and what is found."""
 
     decided: Decided
+    start: Start
     relighting: Relighting
     samples: Samples
     found: Lights
@@ -204,7 +205,7 @@ def _find_light(
             wanted["coat"] = "off"
         parts = samples[pixels.light], samples[pixels.white]
         stage = LightStage(*parts, surface, start, pace, relighting, wanted, device, toned)
-        return _Lighted(decided, relighting, samples, stage.found())
+        return _Lighted(decided, start, relighting, samples, stage.found())
 
 
 def _beyond(
