@@ -90,7 +90,10 @@ def fit_twin(
     caster = caster.threaded(THREADS)
     lighted = _find_light(pixels, twin, caster, start, pace, states, device)
     if lighted.found.toned is not None:
-        lighted = _find_light(pixels, twin, caster, start, pace, states, device, lighted.found.toned)
+        began, toned = stopwatch.total, lighted.found.toned
+        lighted = _find_light(pixels, twin, caster, start, pace, states, device, toned)
+        again_s = toned[1].fit_s + stopwatch.total - began
+        lighted.found.decisions["tone"] = replace(toned[1], fit_s=round(again_s, 3))
     relighting, samples, state = lighted.relighting, lighted.samples, lighted.found.state
     with stopwatch.stage("detail"):
         samples = relighting.guided(samples)
