@@ -90,11 +90,11 @@ def test_what_points_mirror_is_the_radiosity_of_tissue_over_their_own_irradiance
     found = light.expanded(
         replace(places, mirrored=scipy.sparse.csr_array(rows)), 0.5, 2.0, albedo, torch.zeros(len(seen))
     )
-    np.testing.assert_allclose(found.contrast[seen], (leaving / own)[seen], rtol=1e-4)
-    assert (found.contrast[~seen] == 1).all()
+    np.testing.assert_allclose(found.surroundings[seen], (leaving / own)[seen], rtol=1e-4)
+    assert (found.surroundings[~seen] == 1).all()
     assert (leaving > BASE_COLOR * irradiance).all()
     there = found.irradiance(0.5, 2.0)
-    torch.testing.assert_close(found.mirrored(there), there * found.contrast)
+    torch.testing.assert_close(found.mirrored(there), there * found.surroundings)
 
 
 def test_the_expansion_is_exact_where_it_was_made_and_follows_the_light(sphere):

@@ -80,7 +80,7 @@ class Places:
         """Values [P, M, C] of patches in M views at the points, [N, C]."""
         return self._from_views @ _by_view(per_patch, self._from_views)
 
-    def contrast(self, leaving: np.ndarray, arriving: np.ndarray) -> np.ndarray:
+    def surroundings(self, leaving: np.ndarray, arriving: np.ndarray) -> np.ndarray:
         """Radiosity of what the points mirror, of that of patches [P, M, 3], over what is ``arriving`` [N, 3]
         at them; 1 where they mirror what nobody saw."""
         met = np.diff(self.mirrored.indptr) > 0
@@ -117,7 +117,7 @@ class Bounce(Rows):
     Attributes:
         log, by_scale, by_gamma: float32 [N, 3]. by_n, by_q: float32 [N], the channels' mean.
         gloss: float32 [N], share of what the points mirror that their white lobes send to the camera.
-        contrast: float32 [N, 3], radiosity of that over E; None: 1.
+        surroundings: float32 [N, 3], radiosity of that over E; None: 1.
         shown: float32 [N, 3], γ·ln of the points' base colours that throw it; None: it follows no colours.
     """
 
@@ -127,7 +127,7 @@ class Bounce(Rows):
     by_scale: Tensor
     by_gamma: Tensor
     gloss: Tensor
-    contrast: Tensor | None = None
+    surroundings: Tensor | None = None
     shown: Tensor | None = None
 
     def to(self, device: torch.device) -> Bounce:
@@ -144,7 +144,7 @@ class Bounce(Rows):
 
     def mirrored(self, irradiance: Tensor) -> Tensor:
         """Radiosity [N, 3] of what the points mirror to their cameras, where this is their E [N, 3]."""
-        return irradiance if self.contrast is None else irradiance * self.contrast
+        return irradiance if self.surroundings is None else irradiance * self.surroundings
 
     @property
     def following(self) -> Tensor:
@@ -230,5 +230,7 @@ class BouncedLight:
             torch.from_numpy(np.ascontiguousarray(x, np.float32))
             for x in (level, by_n, by_q, by_scale, by_gamma)
         ]
-        contrast = None if places.mirrored is None else torch.from_numpy(places.contrast(leaving, irradiance))
-        return Bounce(*columns, gloss, contrast)
+        surroundings = (
+            None if places.mirrored is None else torch.from_numpy(places.surroundings(leaving, irradiance))
+        )
+        return Bounce(*columns, gloss, surroundings)
