@@ -46,6 +46,7 @@ KNOB_COLORS = (
     "#c2679b",
     "#7a8b2f",
     "#6c757d",
+    "#3b4cc0",
 )
 PRESET_COLOR, FRONT_COLOR, KNEE_COLOR = "#222222", "#bbbbbb", "#d1495b"
 STAGE_COLORS = {
@@ -111,7 +112,7 @@ def _gains(axes: Axes, rows: list[dict], gain: str) -> None:
     seconds, gains = column(rows, "seconds_added"), column(rows, gain)
     axes.axhline(0, color=FRONT_COLOR, lw=1, zorder=1)
     axes.axvline(0, color=FRONT_COLOR, lw=1, zorder=1)
-    colors = [KNOB_COLORS[FITTED.index(row["effect"])] for row in rows]
+    colors = [KNOB_COLORS[FITTED.index(row["effect"]) % len(KNOB_COLORS)] for row in rows]
     for x, y, color, row in zip(seconds, gains, colors, rows, strict=True):
         filled = {} if row["state"] == "on" else {"mfc": "white"}
         axes.plot(x, y, "o", ms=6, color=color, zorder=3, **filled)
