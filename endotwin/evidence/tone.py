@@ -16,10 +16,10 @@ import numpy as np
 
 from endotwin.effects import Decision
 from endotwin.effects.tone import Tone
+from endotwin.evidence.coat import LEAST_SIGHTINGS
 from endotwin.evidence.probe import MIN_SIGMAS, Verdict, compared
 from endotwin.pixels.fixed_effects import Design, regress
 
-LEAST_SIGHTINGS = 16
 ROUNDS = 4
 
 TISSUE = 2

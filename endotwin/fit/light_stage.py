@@ -81,18 +81,18 @@ class Cost:
     pixels: int
 
 
-Judged = tuple[Tone, Decision]
+Toned = tuple[Tone, Decision]
 
 
 @dataclass(frozen=True)
-class Found:
+class FoundLight:
     """The state, what it cost, and whether there are a coat and a tone curve; ``toned``: a new curve, beside
     which effects, light and materials are to be found again."""
 
     state: State
     cost: Cost
     decisions: dict[str, Decision]
-    toned: Judged | None
+    toned: Toned | None
 
 
 @dataclass(frozen=True)
@@ -124,7 +124,7 @@ class LightStage:
         relighting: Relighting,
         wanted: Mapping[str, str],
         device: torch.device,
-        toned: Judged | None,
+        toned: Toned | None,
     ):
         self._clipped, self._surface, self._pace, self._wanted = clipped, surface, pace, wanted
         self._relighting, self._undetermined = relighting, start.undetermined
@@ -146,16 +146,16 @@ class LightStage:
         step_s = pace.stopwatch.total - ready
         self._cost = Cost(ready - began, step_s, len(points) * len(operator.cells_mm), len(samples))
 
-    def found(self) -> Found:
+    def found(self) -> FoundLight:
         """What is found; where that is a tone curve, as soon as it is."""
         toned = self._in_one_step() if self._relighting.bounces else None
         if not self._relighting.bounces:
             toned = self._in_turns()
         hurried = Decision("off", "no time to judge")
         decisions = dict.fromkeys(self._wanted, hurried) | self._decisions
-        return Found(self._state, self._cost, decisions, toned)
+        return FoundLight(self._state, self._cost, decisions, toned)
 
-    def _in_turns(self) -> Judged | None:
+    def _in_turns(self) -> Toned | None:
         """Light by what varies within vertices, then the materials, then light again."""
         number = 0
         while number < STEPS:
@@ -175,7 +175,7 @@ class LightStage:
             number = self._next(number, STEPS, gain, COAT_STEP)
         return None
 
-    def _in_one_step(self) -> Judged | None:
+    def _in_one_step(self) -> Toned | None:
         """Light and materials in one step, for the strength of the bounce; then light by what varies. Ends
         early where photos show no bounce."""
         number, best = 0, None
@@ -252,7 +252,7 @@ class LightStage:
             return number + 1
         return steps if len(self._decisions) == len(self._wanted) else max(number + 1, coat_step)
 
-    def _newly_toned(self, number: int, step: int) -> Judged | None:
+    def _newly_toned(self, number: int, step: int) -> Toned | None:
         """A tone curve and why, if this is the ``step`` in which it is judged, and there is one."""
         if number != step or "tone" in self._decisions:
             return None

@@ -215,21 +215,19 @@ class Bouncer:
 
     def _mirrored(self, samples: Samples, view: np.ndarray) -> scipy.sparse.csr_array:
         """CSR [N, P], from patches to what each sample mirrors to its camera."""
-        surface, corner = self._surface, samples.barycentric.numpy()
-        triangles = surface.triangles[samples.triangle.numpy()]
+        surface, to_vertex = self._surface, self._radiosity.to_vertex
+        triangles = torch.from_numpy(surface.triangles.astype(np.int64))
         points_mm, normals = (
-            np.einsum("nk,nka->na", corner, values[triangles]).astype(np.float32)
+            at_pixels(samples, triangles, torch.from_numpy(values)).numpy()
             for values in (surface.vertices_mm, surface.normals)
         )
         eye_mm = samples.views.T_local_camera[view, :3, 3].astype(np.float32)
         triangle, barycentric = met_mirrored(self._caster, points_mm, eye_mm, unit(normals))
         met = triangle >= 0
         nearest = surface.triangles[triangle[met], barycentric[met].argmax(axis=1)]
-        rows = self._radiosity.to_vertex[nearest]
-        counts = np.zeros(len(met), rows.indptr.dtype)
-        counts[met] = np.diff(rows.indptr)
-        pointers = np.concatenate([[0], np.cumsum(counts)])
-        return scipy.sparse.csr_array((rows.data, rows.indices, pointers), (len(met), rows.shape[1]))
+        one = np.ones(len(nearest), np.float32)
+        picked = (one, nearest, np.concatenate([[0], np.cumsum(met)]))
+        return scipy.sparse.csr_array(picked, shape=(len(met), to_vertex.shape[0])) @ to_vertex
 
 
 def regained(samples: Samples, material: Tensor, shared: Globals, effects: Effects, width: float) -> Effects:

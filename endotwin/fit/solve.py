@@ -24,8 +24,7 @@ from endotwin.fit.bloom import bloom
 from endotwin.fit.film import Found, Model
 from endotwin.fit.gauss_newton import CPU, GaussNewton, State, unusual
 from endotwin.fit.hashgrid import HashGrid, HashOperator
-from endotwin.fit.light_stage import Cost, Judged, LightStage
-from endotwin.fit.light_stage import Found as Lights
+from endotwin.fit.light_stage import Cost, FoundLight, LightStage, Toned
 from endotwin.fit.lighting import Relighting, lit
 from endotwin.fit.sparkle import sparkle
 from endotwin.fit.tilt import Tilter
@@ -89,11 +88,10 @@ def fit_twin(
         logger.warning("the photos cannot tell %s: kept at the prior", " and ".join(start.undetermined))
     caster = caster.threaded(THREADS)
     lighted = _find_light(pixels, twin, caster, start, pace, states, device)
+    began = stopwatch.total
     if lighted.found.toned is not None:
-        began, toned = stopwatch.total, lighted.found.toned
-        lighted = _find_light(pixels, twin, caster, start, pace, states, device, toned)
-        again_s = toned[1].fit_s + stopwatch.total - began
-        lighted.found.decisions["tone"] = replace(toned[1], fit_s=round(again_s, 3))
+        lighted = _find_light(pixels, twin, caster, start, pace, states, device, lighted.found.toned)
+    again_s = stopwatch.total - began
     relighting, samples, state = lighted.relighting, lighted.samples, lighted.found.state
     with stopwatch.stage("detail"):
         samples = relighting.guided(samples)
@@ -111,6 +109,9 @@ def fit_twin(
         )
     with stopwatch.stage("price"):
         decisions = {**lighted.decided.decisions, **lighted.found.decisions, **why}
+        if state.shared.tone is not None:
+            tone = decisions["tone"]
+            decisions["tone"] = replace(tone, fit_s=round(tone.fit_s + again_s, 3))
         if "interreflection" in lighted.decided.effects and not relighting.bounces:
             decisions["interreflection"] = _without_bounce(decisions["interreflection"])
         if left is not None and (said := residual_warning(left, twin.sequence(), decisions)):
@@ -172,7 +173,7 @@ class _Lighted:
     start: Start
     relighting: Relighting
     samples: Samples
-    found: Lights
+    found: FoundLight
 
 
 def _find_light(
@@ -183,7 +184,7 @@ def _find_light(
     pace: Pace,
     states: Mapping[str, str],
     device: torch.device,
-    toned: Judged | None = None,
+    toned: Toned | None = None,
 ) -> _Lighted:
     """The effects that the photos show, without a tone curve that was found before, and light, response and
     coarse materials beside them; ``start`` is that of photos as they are."""

@@ -1,11 +1,11 @@
 """The radiance of a surface point: the one place where it is written, for the renderer and for the fit.
 
-x = Σ_k g_k·(D_k·b/π + f0·S_k + w·f0_water·S'_k) + 2·L0·(E·b + B·ρ), with g = 2π·L·(n·ωi) of each guide, D
-the diffuse factor, S the specular lobe of the tissue and S' that of a coat of weight w, E what other tissue
+x = Σ_k g_k·(D_k·b/π + f0·S_k + w·f0_water·S'_k) + 2·L0·(E·b + B·ρ), with g = 2π·L·(n·ωi) of each guide, D the
+diffuse factor, S the specular lobe of the tissue and S' that of a coat of weight w, E what other tissue
 throws on the point for L0 = 1, B the radiosity of what the point mirrors to the camera, and ρ the white
-lobes' share of that. Han & Wu 2025 with one guide at the
-lens, no coat and no E; Burley's diffuse lobe unless D is 1. It is linear in the base colour b, and in what
-each guide gives exponential in n and q: the derivatives by those follow from the same pieces.
+lobes' share of that. Han & Wu 2025 with one guide at the lens, no coat and no E; Burley's diffuse lobe unless
+D is 1. It is linear in the base colour b, and in what each guide gives exponential in n and q: the
+derivatives by those follow from the same pieces.
 """
 
 from __future__ import annotations

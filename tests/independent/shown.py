@@ -17,12 +17,14 @@ the smaller, the more does a small fault of a model bend it.
 from __future__ import annotations
 
 import math
+from collections.abc import Collection
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
 from independent.picture import Studio, View, displayed
+from independent.scene import Scene
 
 STEP = 3
 """Of the pixels, every third each way is looked at."""
@@ -42,17 +44,23 @@ DARKEST = 1e-4
 def shown_levels(studio: Studio) -> dict[str, dict[str, float]]:
     """Of each effect of the studio's scene: ``levels`` of 255 that it shows, and ``db`` by which a perfect
     model without it would lie above the photos' noise."""
-    scene, grey, colored = studio.scene, Pixels(studio), Pixels(studio, channels=3)
-    found = {}
-    for name in sorted(scene.effects):
-        pixels = colored if name == "tone" else grey
-        present = scene.effects if name == "tone" else scene.effects - {"tone"}
-        lacking = scene.having(present).without(name).effects
-        x = pixels.radiance(lacking)
-        value = displayed(x, scene.having(lacking))
-        full = displayed(pixels.radiance(present), scene.having(present))
+    scene, plain = studio.scene, studio.scene.without("tone")
+    found = _shown(Pixels(studio), plain, plain.effects)
+    if "tone" in scene.effects:
+        found |= _shown(Pixels(studio, channels=3), scene, {"tone"})
+    return found
+
+
+def _shown(pixels: Pixels, scene: Scene, names: Collection[str]) -> dict[str, dict[str, float]]:
+    """What the effects ``names`` of the scene show at the pixels."""
+    full, found = displayed(pixels.radiance(scene.effects), scene), {}
+    for name in sorted(names):
+        lacking = scene.without(name)
+        x = pixels.radiance(lacking.effects)
+        value = displayed(x, lacking)
         columns = {"gamma": np.log(x), "n": pixels.log_axis, "q": pixels.log_distance}
-        left = pixels.left(full - value, value, [*columns.values(), *pixels.taken_up(_rest(name, lacking))])
+        rest = pixels.taken_up(_rest(name, lacking.effects))
+        left = pixels.left(full - value, value, [*columns.values(), *rest])
         found[name] = {"levels": left, "db": 10 * math.log10(1 + left**2 / (scene.noise_levels**2 + 1 / 12))}
     return found
 
