@@ -78,6 +78,7 @@ def decide(
     glints: Callable[[], Glints],
     wanted: Mapping[str, str],
     late: Callable[[], bool] = lambda: False,
+    near_mm: Guides = AT_LENS,
 ) -> Decided:
     """Decide the effects of the light from ``samples`` that tell it.
 
@@ -85,9 +86,10 @@ def decide(
         glints: those of the photos, looked for where guides are sought.
         wanted: auto, on or off by name of the effect; auto unless given.
         late: whether guides are not to be sought a second time.
+        near_mm: guides near which those are that there may be; the lens: they are sought wherever they are.
     """
     probe = Probe(samples, twin, caster)
-    trial = _Trial(probe, glints, wanted, late)
+    trial = _Trial(probe, glints, wanted, late, near_mm)
     kept = trial.together()
     kept = trial.shadowed(kept)
     for name in BESIDE:
@@ -104,8 +106,10 @@ class _Trial:
         glints: Callable[[], Glints],
         wanted: Mapping[str, str],
         late: Callable[[], bool],
+        near_mm: Guides,
     ):
         self._probe, self._glints, self._wanted, self._late = probe, cache(glints), wanted, late
+        self._near_mm = near_mm
         self._decisions: dict[str, Decision] = {}
         self._seconds = dict.fromkeys((*TOGETHER, *BESIDE), 0.0)
         self._model, self._bouncing = cache(self._fitted), cache(self._bounced)
@@ -135,19 +139,25 @@ class _Trial:
         Where bounced light is left out, a guide near the lens throws into the shadows what nothing else does.
         """
         base = replace(self._model(best).hypothesis, vignetting=self.wanted("vignetting") != "off")
-        found_mm = found_guides(self._probe, base, self._glints(), self.wanted("offset") == "on")
+        found_mm = self._found_guides(base, self.wanted("offset") == "on")
         bounces = base.bounced is not None
         self._guides_mm = dict.fromkeys((False, True), found_mm)
         if found_mm == AT_LENS or self.wanted("interreflection") == "off" or self._late():
             return
         if self.wanted("interreflection") == "auto":
             other = replace(base, bounced=None if bounces else self._bouncing(AT_LENS))
-            other_mm = found_guides(self._probe, other, self._glints(), False)
+            other_mm = self._found_guides(other, False)
             if other_mm != AT_LENS:
                 self._guides_mm[not bounces] = other_mm
         own = Hypothesis(self._guides_mm[True], shadows=True, gain=base.gain)
         own = replace(own, bounced=self._bouncing(own.guides_mm))
         self._guides_mm[True] = Search.of(self._probe, own, self._glints()).polished()
+
+    def _found_guides(self, base: Hypothesis, forced: bool) -> Guides:
+        if self._near_mm == AT_LENS:
+            return found_guides(self._probe, base, self._glints(), forced)
+        near = replace(base, guides_mm=self._near_mm, shadows=True)
+        return Search.of(self._probe, near, self._glints()).polished()
 
     @property
     def _beside_lens(self) -> bool:

@@ -131,15 +131,16 @@ class LogLight:
         slopes = [axis, -distance, (1 - shine) * self.log_burley, shine, shine * by_roughness]
         if self.bounced is not None:
             terms = np.c_[terms, self.bounced.at(n, q)]
-            still = np.zeros(len(terms))
-            bounced = self.bounced.by_n, self.bounced.by_q, still, still, still
-            slopes = [np.c_[pair] for pair in zip(slopes, bounced, strict=True)]
         top = terms.max(axis=1, keepdims=True)
         share = np.exp(terms - top)
-        total = share.sum(axis=1, keepdims=True)
-        share /= total
-        by_n, by_q, *by_tissue = ((share * slope).sum(axis=1) for slope in slopes)
-        level = (top + np.log(total))[:, 0]
+        total = np.einsum("nk->n", share)
+        share /= total[:, None]
+        guides = share[:, : axis.shape[1]]
+        by_n, by_q, *by_tissue = (np.einsum("nk,nk->n", guides, slope) for slope in slopes)
+        if self.bounced is not None:
+            by_n += share[:, -1] * self.bounced.by_n
+            by_q += share[:, -1] * self.bounced.by_q
+        level = top[:, 0] + np.log(total)
         return np.stack([by_n, by_q, level - n * by_n - q * by_q, *by_tissue], axis=1)
 
     def _lobe(self, roughness: float) -> tuple[np.ndarray, np.ndarray]:

@@ -60,7 +60,7 @@ def _guided(samples: Samples, surface: Surface, caster: Caster, effects: Effects
     view = views.row(samples.frame)
     order = np.argsort(view, kind="stable")
     found = {
-        name: np.empty((len(samples), len(guides_mm)), np.float32) for name in Guided.__dataclass_fields__
+        name: np.empty((len(guides_mm), len(samples)), np.float32).T for name in Guided.__dataclass_fields__
     }
     for rows in filter(len, np.split(order, np.flatnonzero(np.diff(view[order])) + 1)):
         part = samples[torch.from_numpy(rows)]

@@ -24,12 +24,13 @@ from endotwin.fit.bloom import bloom
 from endotwin.fit.film import Found, Model
 from endotwin.fit.gauss_newton import CPU, GaussNewton, State, unusual
 from endotwin.fit.hashgrid import HashGrid, HashOperator
-from endotwin.fit.light_stage import Cost, FoundLight, LightStage, Toned
+from endotwin.fit.light_stage import Cost, FoundLight, LightStage
 from endotwin.fit.lighting import Relighting, lit
 from endotwin.fit.sparkle import sparkle
 from endotwin.fit.tilt import Tilter
 from endotwin.fit.unexplained import residual_warning
 from endotwin.light.film import Film
+from endotwin.light.guides import AT_LENS
 from endotwin.pixels.length_unit import unit_mm
 from endotwin.pixels.pace import ITERATIONS, Pace
 from endotwin.pixels.samples import Samples, Views, drawn, gather
@@ -90,7 +91,7 @@ def fit_twin(
     lighted = _find_light(pixels, twin, caster, start, pace, states, device)
     began = stopwatch.total
     if lighted.found.toned is not None:
-        lighted = _find_light(pixels, twin, caster, start, pace, states, device, lighted.found.toned)
+        lighted = _find_light(pixels, twin, caster, start, pace, states, device, lighted)
     again_s = stopwatch.total - began
     relighting, samples, state = lighted.relighting, lighted.samples, lighted.found.state
     with stopwatch.stage("detail"):
@@ -184,11 +185,15 @@ def _find_light(
     pace: Pace,
     states: Mapping[str, str],
     device: torch.device,
-    toned: Toned | None = None,
+    before: _Lighted | None = None,
 ) -> _Lighted:
-    """The effects that the photos show, without a tone curve that was found before, and light, response and
-    coarse materials beside them; ``start`` is that of photos as they are."""
+    """The effects that the photos show, and light, response and coarse materials beside them; without the
+    tone curve that was found ``before``, and near the guides beside which it was. ``start`` is that of photos
+    as they are."""
     samples, surface = pixels.samples, twin.surface
+    toned, near_mm = None, None
+    if before is not None:
+        toned, near_mm = before.found.toned, before.decided.effects.guides_mm
     shown = samples if toned is None else samples.untoned(toned[0])
     mesh = surface.triangles, len(surface.vertices_mm)
     with pace.stopwatch.stage("effects"):
@@ -196,7 +201,8 @@ def _find_light(
         def glints() -> Glints:
             return Glints.of(shown[pixels.smooth], surface, start)
 
-        decided = decide(shown[pixels.telling], twin, caster, glints, states, pace.light_is_over)
+        late, telling = pace.light_is_over, shown[pixels.telling]
+        decided = decide(telling, twin, caster, glints, states, late, near_mm or AT_LENS)
         relighting = Relighting(surface, caster, decided.effects, samples.views)
         if decided.light is not None:
             start = start_at(shown[pixels.start], *mesh, decided.light, decided.gamma)

@@ -122,7 +122,8 @@ def shares(lit: Lit, log_light: LogLight, roughness: Tensor, lobes: Lobes) -> li
     guides, found = lit.guides, []
     count = guides.cos_i.shape[1]
     for k in range(count):
-        cos_i, sin2_m, cos_d, log_axis, log_distance = (value[:, k] for value in vars(guides).values())
+        columns = (value[:, k].contiguous() for value in vars(guides).values())
+        cos_i, sin2_m, cos_d, log_axis, log_distance = columns
         log_strength = shading.log_spotlight(*log_light, log_axis, log_distance)
         if lit.log_exposure is not None:
             log_strength = log_strength + lit.log_exposure

@@ -15,7 +15,7 @@ from torch import Tensor
 from endotwin.light.incidence import COS_MIN, DISTANCE_MIN_MM
 from endotwin.surface.casting import Caster
 from endotwin.surface.rows import Rows
-from endotwin.surface.vectors import dot, unit
+from endotwin.surface.vectors import dot, scaled, unit
 
 SHADOW_BIAS = 0.015
 """A point is in shadow where a ray to it ends this share of its length before it: a fold rim throws
@@ -87,7 +87,7 @@ def guided(
         columns["cos_d"].append(dot(wi, wm))
         columns["log_axis"].append(log_axis(np.maximum(-wi[:, 2], COS_MIN), profile))
         columns["log_distance"].append(np.log(distance_mm))
-    return Guided(**{name: torch.from_numpy(np.stack(value, axis=1)) for name, value in columns.items()})
+    return Guided(**{name: torch.from_numpy(np.stack(value)).T for name, value in columns.items()})
 
 
 def visible_from(
@@ -100,12 +100,18 @@ def visible_from(
     rotation, centre = T_local_camera[:3, :3].astype(np.float32), T_local_camera[:3, 3].astype(np.float32)
     seen = np.empty((len(points_mm), len(guides_mm)), np.float32)
     for k, guide_mm in enumerate(np.asarray(guides_mm, np.float32)):
-        ray = points_mm - guide_mm
-        distance_mm = np.maximum(np.sqrt(dot(ray, ray)), DISTANCE_MIN_MM)
-        directions = (ray / distance_mm[:, None]) @ rotation.T
-        origin = np.broadcast_to(centre + rotation @ guide_mm, directions.shape)
-        seen[:, k] = caster.unobstructed(origin, directions, distance_mm * (1 - SHADOW_BIAS))
+        rays_mm = (points_mm - guide_mm) @ rotation.T
+        origins = np.broadcast_to(centre + rotation @ guide_mm, rays_mm.shape)
+        seen[:, k] = sees(caster, origins, rays_mm)
     return seen
+
+
+def sees(caster: Caster, origins_mm: np.ndarray, rays_mm: np.ndarray) -> np.ndarray:
+    """Bool [N]: whether ``origins_mm`` [N, 3] see the surface at the ends of ``rays_mm`` [N, 3], both in its
+    frame."""
+    distance_mm = np.maximum(np.sqrt(dot(rays_mm, rays_mm)), DISTANCE_MIN_MM)
+    directions = scaled(rays_mm, 1 / distance_mm)
+    return caster.unobstructed(origins_mm, directions, distance_mm * (1 - SHADOW_BIAS))
 
 
 def lamps_mm(guides_mm: Sequence | None) -> np.ndarray:

@@ -59,8 +59,11 @@ class FixedEffects:
 def without_means(values: np.ndarray, weight: np.ndarray, group: np.ndarray, count: int) -> np.ndarray:
     """Values [N, K] less the weighted mean of each of ``count`` groups [N]: the variation within groups."""
     total = np.maximum(np.bincount(group, weight, count), 1e-12)
-    means = [np.bincount(group, weight * column, count) / total for column in values.T]
-    return values - np.stack(means, axis=1)[group]
+    within = np.empty(values.shape[::-1])
+    for column, varying in zip(values.T, within, strict=True):
+        mean = np.bincount(group, weight * column, count) / total
+        np.subtract(column, mean.take(group), out=varying)
+    return within.T
 
 
 def regress(target: np.ndarray, design: Design, categories: int = 0, rounds: int = REWEIGHTS) -> FixedEffects:
@@ -101,9 +104,10 @@ def _normal_equations(
     category = design.category
     sums = [np.bincount(category, weight * column, categories) for column in within.T]
     border = np.stack(sums[:-1], axis=1)
-    shared = csr_array((weight, (design.group, category)), shape=(design.count, categories))
-    total = np.maximum(np.asarray(shared.sum(axis=1)).ravel(), 1e-12)
-    between = (shared.T @ (csr_array((1 / total, (np.arange(len(total)),) * 2)) @ shared)).toarray()
+    total = np.maximum(np.bincount(design.group, weight, design.count), 1e-12)
+    shared = weight / np.sqrt(total).take(design.group)
+    shared = csr_array((shared, (design.group, category)), shape=(design.count, categories))
+    between = (shared.T @ shared).toarray()
     dummies = np.diag(np.bincount(category, weight, categories)) - between
     full = np.block([[normal, border[1:].T], [border[1:], dummies[1:, 1:]]])
     return full, np.r_[right, sums[-1][1:]]
