@@ -86,7 +86,7 @@ def decide(
         glints: those of the photos, looked for where guides are sought.
         wanted: auto, on or off by name of the effect; auto unless given.
         late: whether guides are not to be sought a second time.
-        near_mm: guides near which those are that there may be; the lens: they are sought wherever they are.
+        near_mm: guides near which others are looked for first; the lens: none.
     """
     probe = Probe(samples, twin, caster)
     trial = _Trial(probe, glints, wanted, late, near_mm)
@@ -154,10 +154,7 @@ class _Trial:
         self._guides_mm[True] = Search.of(self._probe, own, self._glints()).polished()
 
     def _found_guides(self, base: Hypothesis, forced: bool) -> Guides:
-        if self._near_mm == AT_LENS:
-            return found_guides(self._probe, base, self._glints(), forced)
-        near = replace(base, guides_mm=self._near_mm, shadows=True)
-        return Search.of(self._probe, near, self._glints()).polished()
+        return found_guides(self._probe, base, self._glints(), forced, self._near_mm)
 
     @property
     def _beside_lens(self) -> bool:

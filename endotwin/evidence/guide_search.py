@@ -47,18 +47,25 @@ def ring_mm(probe: Probe, share: float = 1.0) -> np.ndarray:
     return (radius_mm * np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)).astype(np.float32)
 
 
-def found_guides(probe: Probe, base: Hypothesis, glints: Glints, forced: bool) -> Guides:
+def found_guides(
+    probe: Probe, base: Hypothesis, glints: Glints, forced: bool, near_mm: Guides = AT_LENS
+) -> Guides:
     """Positions of one to three guides that predict held-out pixels better than ``base``, camera frame; the
-    lens where none do. They are sought where they explain the ``glints`` as well.
+    lens where none do. They are sought where they explain the ``glints`` as well, and first ``near_mm``.
 
     One guide, and a glance at two and three, tell whether a search is worth its time. Two in the plane of the
     lens pass for one behind it: another is believed only beside those before it where they are best. With
     ``forced`` there is always a position: that of the most guides, if none is worth it.
     """
+    plain, best, guides_mm = probe.fit(base), None, ()
+    if near_mm != AT_LENS:
+        near = replace(base, guides_mm=near_mm, shadows=True)
+        near = replace(near, guides_mm=Search.of(probe, near, glints).polished())
+        if probe.compare(plain, probe.fit(near)).keep:
+            return near.guides_mm
     search = Search.of(probe, base, glints)
     if not forced and not search.hints():
         return AT_LENS
-    plain, best, guides_mm = probe.fit(base), None, ()
     for number in range(1, MOST_GUIDES + 1):
         guides_mm = search.best(guides_mm)
         found = probe.fit(replace(base, guides_mm=guides_mm, shadows=True))

@@ -20,7 +20,8 @@ from endotwin.evidence.coat import LEAST_SIGHTINGS
 from endotwin.evidence.probe import MIN_SIGMAS, Verdict, compared
 from endotwin.pixels.fixed_effects import Design, regress
 
-ROUNDS = 4
+ROUNDS, SETTLED = 4, 0.002
+"""At most so many, and none after one that moves the contrast by less: a twentieth of a level of 255."""
 
 TISSUE = 2
 """Slopes by what whitens: f0 and roughness."""
@@ -96,7 +97,9 @@ def steadied(tone: Tone, without: Callable[[Tone], Hues], passing: int = TISSUE)
         if len(hues.residual) < LEAST_SIGHTINGS:
             return tone
         more = float(regress(hues.residual, hues.design(passing)).coefficients[-1])
-        tone = Tone(float(np.clip(tone.contrast + more, contrast.low, contrast.high)))
+        before, tone = tone, Tone(float(np.clip(tone.contrast + more, contrast.low, contrast.high)))
+        if abs(tone.contrast - before.contrast) < SETTLED:
+            break
     return tone
 
 

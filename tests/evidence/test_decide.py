@@ -67,6 +67,13 @@ def test_a_scene_lit_as_in_the_paper_calls_for_no_effect(example):
     assert set(states(decide(samples, twin, caster, glints, {})).values()) == {"off"}
 
 
+def test_guides_that_are_known_beforehand_are_given_up_where_no_photo_shows_them(example):
+    near_mm = ((-2.0, 0.5, 0.0), (2.0, 0.0, 0.0))
+    decided = decide(*reordered(example), {}, near_mm=near_mm)
+    assert decided.decisions["offset"].state == "off"
+    assert decided.effects.guides_mm is None
+
+
 def test_gain_is_found_to_a_hundredth(example):
     twin, caster, samples, glints = example
     log_gain = np.random.default_rng(3).normal(0, 0.15, 64)
@@ -143,6 +150,13 @@ GUIDES_MM = [[-2.5, 1.0, 0.0], [2.5, 0.0, 0.0]]
 def test_guides_are_found_within_half_a_millimetre_with_their_shadows(lit_from_beside):
     decided = decide(*reordered(lit_from_beside), {})
     assert states(decided) == {**dict.fromkeys(LIGHT, "off"), "offset": "on", "shadows": "on"}
+    np.testing.assert_allclose(sorted(decided.effects["offset"].guides_mm), GUIDES_MM, atol=0.5)
+
+
+@needs_data
+def test_guides_are_found_from_near_them_as_from_nowhere(lit_from_beside):
+    near_mm = tuple(map(tuple, np.add(GUIDES_MM, [[0.6, -0.4, 0.0], [-0.5, 0.5, -0.3]])))
+    decided = decide(*reordered(lit_from_beside), {}, near_mm=near_mm)
     np.testing.assert_allclose(sorted(decided.effects["offset"].guides_mm), GUIDES_MM, atol=0.5)
 
 
