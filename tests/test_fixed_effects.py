@@ -1,0 +1,43 @@
+"""Regression with an intercept a group, against NumPy's least squares with a column for each."""
+
+import numpy as np
+import pytest
+
+from endotwin.pixels.fixed_effects import DENSE, Design, regress, without_means
+
+
+def made(count: int, groups: int, categories: int) -> tuple[np.ndarray, Design]:
+    """Values of which columns, groups and categories explain all but noise."""
+    random = np.random.default_rng(count)
+    columns = random.normal(size=(count, 3))
+    group = np.r_[np.arange(groups), random.integers(0, groups, count - groups)]
+    category = random.integers(0, categories, count)
+    target = columns @ [1.0, -2.0, 0.5] + random.normal(size=groups)[group] + 0.1 * category
+    target += 0.1 * random.normal(size=count)
+    return target, Design(columns, group, groups, category, weight=random.uniform(0.5, 2, count))
+
+
+@pytest.mark.parametrize(("count", "groups", "categories"), [(200, 10, 4), (1200, 400, 40)])
+def test_a_round_is_least_squares_with_a_column_for_every_group_and_category(count, groups, categories):
+    target, design = made(count, groups, categories)
+    assert (groups * categories > DENSE * count) == (groups == 400)
+    found = regress(target, design, categories, rounds=1)
+    dummies = np.eye(groups)[design.group], np.eye(categories)[design.category][:, 1:]
+    root = np.sqrt(design.weight)
+    full = np.hstack([design.columns, *dummies]) * root[:, None]
+    solved = np.linalg.lstsq(full, target * root)[0]
+    np.testing.assert_allclose(found.coefficients, solved[:3], atol=1e-6)
+    np.testing.assert_allclose(found.intercepts, np.r_[0, solved[3 + groups :]], atol=5e-5)  # by the ridge
+
+
+def test_outliers_bend_a_robust_regression_by_less_than_their_share():
+    target, design = made(2000, 20, 3)
+    target[::20] += 50
+    np.testing.assert_allclose(regress(target, design, 3).coefficients, [1.0, -2.0, 0.5], atol=0.02)
+
+
+def test_variation_within_groups_has_no_weighted_mean():
+    _, design = made(200, 10, 4)
+    within = without_means(design.columns, design.weight, design.group, design.count)
+    sums = [np.bincount(design.group, design.weight * column, design.count) for column in within.T]
+    np.testing.assert_allclose(sums, 0, atol=1e-12)
