@@ -16,13 +16,15 @@ from endotwin.effects.gain import Gain
 from endotwin.effects.offset import Offset
 from endotwin.fit.gauss_newton import HUBER, MOST_GAIN_STEP, GaussNewton, State
 from endotwin.fit.model import Globals, at_pixels, slope_by_log_exposure
-from endotwin.fit.normal_equations import Residual
+from endotwin.fit.normal_equations import CHUNK, Residual
 from endotwin.fit.within import Renewed, Varied
 from endotwin.light.bounced import GAMMA_STEP, Albedo, BouncedLight, Places
-from endotwin.light.guides import AT_LENS, COSINE, Guided, guided, log_axis, visible_from
+from endotwin.light.guides import AT_LENS, COSINE, Guided, guided, log_axis, sees
 from endotwin.light.mirror import met_mirrored
 from endotwin.light.radiosity import Radiosity
 from endotwin.pixels.samples import Samples, Views
+from endotwin.run.ahead import ahead
+from endotwin.run.threads import THREADS
 from endotwin.surface import Surface
 from endotwin.surface.casting import Caster
 from endotwin.surface.vectors import unit
@@ -55,25 +57,28 @@ def _log_exposure(samples: Samples, effects: Effects) -> Tensor:
 
 
 def _guided(samples: Samples, surface: Surface, caster: Caster, effects: Effects) -> Guided:
-    """How the guides light the samples, view by view."""
-    views, guides_mm = samples.views, np.asarray(effects.guides_mm, np.float32)
-    view = views.row(samples.frame)
-    order = np.argsort(view, kind="stable")
-    found = {
-        name: np.empty((len(guides_mm), len(samples)), np.float32).T for name in Guided.__dataclass_fields__
-    }
-    for rows in filter(len, np.split(order, np.flatnonzero(np.diff(view[order])) + 1)):
-        part = samples[torch.from_numpy(rows)]
-        pose = views.T_local_camera[view[rows[0]]]
-        corners = surface.normals[surface.triangles[part.triangle.numpy()]]
-        normals = np.einsum("nk,nka->na", part.barycentric.numpy(), corners)
-        normals = unit(normals @ pose[:3, :3].astype(np.float32))
-        visible = None
-        if "shadows" in effects:
-            visible = visible_from(caster, pose, part.points_mm, guides_mm)
-        for name, value in vars(guided(part.points_mm, normals, guides_mm, effects.profile, visible)).items():
-            found[name][rows] = value.numpy()
-    return Guided(**{name: torch.from_numpy(value) for name, value in found.items()})
+    """How the guides light the samples."""
+    guides_mm = np.asarray(effects.guides_mm, np.float32)
+
+    def one(part: Samples) -> Guided:
+        visible = _visible(part, caster, guides_mm) if "shadows" in effects else None
+        return guided(part.points_mm, part.normals(surface), guides_mm, effects.profile, visible)
+
+    parts = list(ahead(one, samples.chunks(CHUNK), THREADS)) or [one(samples)]
+    rows = {name: [getattr(part, name).T for part in parts] for name in Guided.__dataclass_fields__}
+    return Guided(**{name: torch.cat(each, dim=1).T for name, each in rows.items()})
+
+
+def _visible(samples: Samples, caster: Caster, guides_mm: np.ndarray) -> np.ndarray:
+    """Bool [N, K]: which of guides [K, 3] see each sample's point."""
+    points_mm, rotation = samples.points_mm, samples.rotation
+    poses, view = samples.views.T_local_camera, samples.views.row(samples.frame)
+    seen = np.empty((len(samples), len(guides_mm)), bool)
+    for k, guide_mm in enumerate(guides_mm):
+        origins_mm = (poses[:, :3, :3] @ guide_mm + poses[:, :3, 3]).astype(np.float32)[view]
+        rays_mm = np.einsum("nab,nb->na", rotation, points_mm - guide_mm)
+        seen[:, k] = sees(caster, origins_mm, rays_mm)
+    return seen
 
 
 def guides_aside(samples: Samples, surface: Surface, effects: Effects, step_mm: float) -> Iterator[Samples]:
