@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from endotwin.effects.vignetting import squared_radius
-from endotwin.light.guides import sees
+from endotwin.light.guides import visible_in_views
 from endotwin.surface.vectors import unit
 
 if TYPE_CHECKING:
@@ -71,9 +71,8 @@ class Sightings:
     def visible(self, guide_mm: np.ndarray, rows: np.ndarray | None = None) -> np.ndarray:
         """Bool [N]: whether a guide [3] (camera frame) sees each pixel's point (or of those in ``rows``)."""
         rows = slice(None) if rows is None else rows
-        centres_mm = (self.T_local_camera @ np.append(guide_mm, 1.0))[:, :3].astype(np.float32)
-        origins_mm = centres_mm.take(self.frame[rows], axis=0)
-        return sees(self.caster, origins_mm, self.local_points_mm[rows] - origins_mm)
+        points_mm = self.local_points_mm[rows]
+        return visible_in_views(self.caster, self.T_local_camera, self.frame[rows], points_mm, guide_mm)
 
     def visible_to(self, guides_mm: np.ndarray) -> np.ndarray:
         """Bool [N, K]: which of guides [K, 3] see each pixel's point."""

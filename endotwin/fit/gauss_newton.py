@@ -288,21 +288,21 @@ class GaussNewton:
         return FramePattern(pattern.corners[pattern.compact], row, pattern.vertex_count, count)
 
     def _brightened(self, log_gain: np.ndarray) -> Samples:
-        """The trial samples with frames brighter by ``log_gain`` [F], or as they are by [0]."""
-        if not len(log_gain):
-            return self._trial
+        """The trial samples with frames brighter by ``log_gain`` [F]."""
         by_sample = torch.from_numpy(log_gain[self._frames.row[self.trial_rows.numpy()]]).float()
         return replace(self._trial, log_exposure=self._trial.log_exposure + by_sample.to(self._device))
 
     def _predict(self, state: State, log_gain: np.ndarray = _NO_GAINS) -> Tensor:
-        """Display values of the trial samples, [N, 3]; kept for what is asked of the same state next."""
-        if not len(log_gain) and self._known is not None and self._known[0] is state:
-            return self._known[1]
-        material = at_pixels(self._trial, self._triangles, state.materials)
-        predicted = predict(self._brightened(log_gain), material, state.shared)
-        if not len(log_gain):
-            self._known = state, predicted
-        return predicted
+        """Display values of the trial samples, [N, 3], frames brighter by ``log_gain`` [F], or as they are by
+        [0]: those are kept for what is asked of the same state next."""
+        if len(log_gain):
+            return self._displayed(self._brightened(log_gain), state)
+        if self._known is None or self._known[0] is not state:
+            self._known = state, self._displayed(self._trial, state)
+        return self._known[1]
+
+    def _displayed(self, samples: Samples, state: State) -> Tensor:
+        return predict(samples, at_pixels(samples, self._triangles, state.materials), state.shared)
 
     def _solve(
         self, state: State, equations: NormalEquations, scale: float, free: np.ndarray, damping: float

@@ -19,7 +19,7 @@ from endotwin.fit.model import Globals, at_pixels, slope_by_log_exposure
 from endotwin.fit.normal_equations import CHUNK, Residual
 from endotwin.fit.within import Renewed, Varied
 from endotwin.light.bounced import GAMMA_STEP, Albedo, BouncedLight, Places
-from endotwin.light.guides import AT_LENS, COSINE, Guided, guided, log_axis, sees
+from endotwin.light.guides import AT_LENS, COSINE, Guided, guided, log_axis, visible_in_views
 from endotwin.light.mirror import met_mirrored
 from endotwin.light.radiosity import Radiosity
 from endotwin.pixels.samples import Samples, Views
@@ -71,14 +71,11 @@ def _guided(samples: Samples, surface: Surface, caster: Caster, effects: Effects
 
 def _visible(samples: Samples, caster: Caster, guides_mm: np.ndarray) -> np.ndarray:
     """Bool [N, K]: which of guides [K, 3] see each sample's point."""
-    points_mm, rotation = samples.points_mm, samples.rotation
     poses, view = samples.views.T_local_camera, samples.views.row(samples.frame)
-    seen = np.empty((len(samples), len(guides_mm)), bool)
-    for k, guide_mm in enumerate(guides_mm):
-        origins_mm = (poses[:, :3, :3] @ guide_mm + poses[:, :3, 3]).astype(np.float32)[view]
-        rays_mm = np.einsum("nab,nb->na", rotation, points_mm - guide_mm)
-        seen[:, k] = sees(caster, origins_mm, rays_mm)
-    return seen
+    points_mm = np.einsum("nab,nb->na", samples.rotation, samples.points_mm)
+    points_mm += poses[:, :3, 3].astype(np.float32)[view]
+    seen = [visible_in_views(caster, poses, view, points_mm, guide_mm) for guide_mm in guides_mm]
+    return np.stack(seen, axis=1)
 
 
 def guides_aside(samples: Samples, surface: Surface, effects: Effects, step_mm: float) -> Iterator[Samples]:

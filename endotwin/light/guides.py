@@ -102,11 +102,21 @@ def visible_from(
     for k, guide_mm in enumerate(np.asarray(guides_mm, np.float32)):
         rays_mm = (points_mm - guide_mm) @ rotation.T
         origins = np.broadcast_to(centre + rotation @ guide_mm, rays_mm.shape)
-        seen[:, k] = sees(caster, origins, rays_mm)
+        seen[:, k] = _sees(caster, origins, rays_mm)
     return seen
 
 
-def sees(caster: Caster, origins_mm: np.ndarray, rays_mm: np.ndarray) -> np.ndarray:
+def visible_in_views(
+    caster: Caster, T_local_camera: np.ndarray, view: np.ndarray, points_mm: np.ndarray, guide_mm: np.ndarray
+) -> np.ndarray:
+    """Bool [N]: which points [N, 3] (surface's frame), each seen in its ``view`` [N] of those with poses
+    ``T_local_camera`` [M, 4, 4], a guide [3] (camera frame) sees; all in one cast."""
+    guides_mm = (T_local_camera @ np.append(guide_mm, 1.0))[:, :3].astype(np.float32)
+    origins_mm = guides_mm.take(view, axis=0)
+    return _sees(caster, origins_mm, points_mm - origins_mm)
+
+
+def _sees(caster: Caster, origins_mm: np.ndarray, rays_mm: np.ndarray) -> np.ndarray:
     """Bool [N]: whether ``origins_mm`` [N, 3] see the surface at the ends of ``rays_mm`` [N, 3], both in its
     frame."""
     distance_mm = np.maximum(np.sqrt(dot(rays_mm, rays_mm)), DISTANCE_MIN_MM)
