@@ -34,14 +34,21 @@ class Recipe:
         path.write_text(yaml.safe_dump(self.vary, sort_keys=False), encoding="utf-8")
 
 
-POSES = Recipe("poses", "novel poses only")
+POSES = Recipe("poses", "novel poses")
+
+HUE = Recipe(
+    "hue", "the base colour's hue", {"material": ["base_color.r*0.85..1.15", "base_color.b*0.85..1.15"]}
+)
+
+LENS = Recipe(
+    "lens",
+    "a third through the lenses of the test sequences, with the black around their circles",
+    lenses=True,
+)
 
 INGREDIENTS = (
-    Recipe(
-        "material",
-        "base colour and its hue",
-        {"material": ["base_color*0.6..1.4", "base_color.r*0.8..1.2", "base_color.b*0.8..1.2"]},
-    ),
+    HUE,
+    Recipe("material", "brightness of the base colour", {"material": ["base_color*0.6..1.4"]}),
     Recipe(
         "light",
         "exposure, colour, profile and place of the light, response",
@@ -67,6 +74,7 @@ INGREDIENTS = (
         },
         codec=(30, 95),
     ),
+    LENS,
 )
 
 
@@ -84,11 +92,7 @@ def merged(name: str, recipes: tuple[Recipe, ...]) -> Recipe:
     return Recipe(name, words, vary, codec, any(recipe.lenses for recipe in recipes))
 
 
-RENDERED = Recipe(
-    "rendered",
-    "novel poses, a third through the lenses of the test sequences, with the black around their circles",
-    lenses=True,
-)
+RENDERED = merged("rendered", (POSES, HUE, LENS))
 """What stands for endotwin's datasets: what helped (docs/study.md)."""
 
-EVERYTHING = merged("everything", (RENDERED, *INGREDIENTS))
+EVERYTHING = merged("everything", (POSES, *INGREDIENTS))
