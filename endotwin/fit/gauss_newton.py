@@ -218,6 +218,10 @@ class GaussNewton:
         error = self._trial.color.float() / 255 - self._predict(state)
         return max(1.4826 * float(error.abs().median()), NOISE_MIN)
 
+    def tried(self, state: State) -> tuple[Samples, Tensor]:
+        """The trial samples, and what is shown of them, display values [N, 3]."""
+        return self._trial, self._predict(self._here(state))
+
     def cost(self, state: State, noise: float) -> float:
         """Negative log posterior, on the trial samples scaled up to all of them."""
         return self._cost(self._here(state), noise)

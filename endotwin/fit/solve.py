@@ -28,7 +28,7 @@ from endotwin.fit.light_stage import Cost, FoundLight, LightStage
 from endotwin.fit.lighting import Relighting, lit
 from endotwin.fit.sparkle import sparkle
 from endotwin.fit.tilt import Tilter
-from endotwin.fit.unexplained import residual_warning
+from endotwin.fit.unexplained import Remains, cast_warning, residual_warning
 from endotwin.light.film import Film
 from endotwin.light.guides import AT_LENS
 from endotwin.pixels.length_unit import unit_mm
@@ -96,7 +96,7 @@ def fit_twin(
     relighting, samples, state = lighted.relighting, lighted.samples, lighted.found.state
     with stopwatch.stage("detail"):
         samples = relighting.guided(samples)
-        state, normals, left = _find_detail(
+        state, normals, remains = _find_detail(
             samples, twin, state, lighted.found.cost, pace, relighting, device
         )
         twin = replace(twin, surface=replace(surface, normals=normals))
@@ -115,8 +115,8 @@ def fit_twin(
             decisions["tone"] = replace(tone, fit_s=round(tone.fit_s + again_s, 3))
         if "interreflection" in lighted.decided.effects and not relighting.bounces:
             decisions["interreflection"] = _without_bounce(decisions["interreflection"])
-        if left is not None and (said := residual_warning(left, twin.sequence(), decisions)):
-            logger.warning("%s; 'endotwin check %s' looks for the cause", said, twin.source.path)
+        if remains is not None:
+            _warn(remains, twin, decisions)
         effects = relighting.effects
         for effect in beyond:
             effects = effects.including(effect)
@@ -124,6 +124,14 @@ def fit_twin(
     return fitted.with_record(
         fit={"method": "twin", "undetermined": list(lighted.start.undetermined), **stopwatch.to_dict()}
     )
+
+
+def _warn(remains: Remains, twin: Twin, decisions: Mapping[str, Decision]) -> None:
+    """Say where a fit leaves more than it should."""
+    if said := residual_warning(remains.sigma, twin.sequence(), decisions):
+        logger.warning("%s; 'endotwin check %s' looks for the cause", said, twin.source.path)
+    if said := cast_warning(remains):
+        logger.warning("%s", said)
 
 
 @dataclass(frozen=True)
@@ -260,7 +268,7 @@ def _find_detail(
     pace: Pace,
     relighting: Relighting,
     device: torch.device,
-) -> tuple[State, np.ndarray, float | None]:
+) -> tuple[State, np.ndarray, Remains | None]:
     """The state with finer features on top, normals [V, 3] tilted as the photos show, and what is left of the
     photos (None without time for detail); light, response and the coarse features stay.
 
@@ -302,7 +310,7 @@ def _find_detail(
             break
         normals = tilter.tilted(normals)
         pace.report("tilt the normals", number + 1, pace.plan.tilts)
-    return state, normals, solver.noise(state)
+    return state, normals, Remains.of(solver.noise(state), *solver.tried(state))
 
 
 def median_edge_mm(surface: Surface) -> float:

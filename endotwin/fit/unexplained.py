@@ -4,9 +4,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+import torch
+from torch import Tensor
 
 from endotwin.effects import Decision
 from endotwin.effects.noise import LEVEL, Noise
+from endotwin.pixels.samples import Samples
 from endotwin.sequence import Sequence
 
 FRAMES = 4
@@ -15,6 +22,72 @@ FRAMES = 4
 WORSE = 3.0
 """A fit that leaves so many times the photos' noise lacks something: textures finer than the mesh, and what a
 codec adds, leave up to two."""
+
+MIDDLE = (0.1, 0.9)
+"""Display values at which colour is judged: below, rounding and noise have their say; above, clipping."""
+
+CAST = 0.05
+CAST_WIDTHS = 5.0
+"""A photo has another colour than the rest where a channel is off by so much (ln of display values), and by
+so many times what those of the others are: that alone keeps a photo of middle brightness below 37 dB,
+−20·log₁₀(0.05·0.5/√3)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Remains:
+    """What a fit leaves of the training photos.
+
+    Attributes:
+        sigma: robust standard deviation of its residual, display values.
+        casts: float64 [F, 3], by how much each photo's channels are brighter than what is shown: medians of
+            ln(photo/shown) of display values, NaN where no pixel is of middle brightness.
+        frames: int [F], indices of those photos.
+    """
+
+    sigma: float
+    casts: np.ndarray
+    frames: np.ndarray
+
+    @classmethod
+    def of(cls, sigma: float, samples: Samples, shown: Tensor) -> Remains:
+        """What is left of ``samples`` where a fit shows ``shown`` [N, 3]."""
+        samples, shown = samples.to(torch.device("cpu")), shown.cpu().numpy()
+        judged = (shown > MIDDLE[0]) & (shown < MIDDLE[1])
+        photo = np.maximum(samples.color.numpy(), 0.5) * LEVEL
+        log_ratio = np.log(photo / shown.clip(*MIDDLE))
+        row, count = samples.views.row(samples.frame), len(samples.views.frames)
+        order = np.argsort(row, kind="stable")
+        ends = np.searchsorted(row[order], np.arange(count + 1))
+        casts = np.full((count, 3), np.nan)
+        for frame, (first, end) in enumerate(pairwise(ends)):
+            some = order[first:end]
+            for channel in range(3):
+                if (usable := judged[some, channel]).any():
+                    casts[frame, channel] = np.median(log_ratio[some[usable], channel])
+        return cls(sigma, casts, samples.views.frames)
+
+
+def cast_warning(remains: Remains) -> str | None:
+    """A sentence on the photo whose colour departs most from what the fit shows, and on how many others do;
+    None where all agree: white light, one exposure or fitted gains, and one colour of each place, leave none.
+    """
+    known = np.isfinite(remains.casts)
+    if not known.any(axis=0).all():
+        return None
+    off = remains.casts - np.nanmedian(remains.casts, axis=0)
+    size = np.where(known, np.abs(off), 0.0)
+    width = 1.4826 * np.median(size[known])
+    odd = np.flatnonzero(size.max(axis=1) > max(CAST, CAST_WIDTHS * width))
+    if not len(odd):
+        return None
+    worst, channel = np.unravel_index(size.argmax(), size.shape)
+    change = np.expm1(off[worst, channel])
+    others = f" ({len(odd) - 1} more are off)" if len(odd) > 1 else ""
+    return (
+        f"photo {remains.frames[worst]} is {100 * abs(change):.0f} % {'more' if change > 0 else 'less'} "
+        f"{('red', 'green', 'blue')[channel]} than the other photos of the same places{others}: was the "
+        f"white balance or the light another? Leave such photos out"
+    )
 
 
 def residual_warning(left: float, sequence: Sequence, decisions: Mapping[str, Decision]) -> str | None:
