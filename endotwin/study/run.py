@@ -37,7 +37,7 @@ from endotwin.study.arms import HEADLINE, Arm, arms
 from endotwin.study.frames import Frames, kept, lit_pixels, of_dataset, of_sequence, require_depth
 from endotwin.study.leak import require_unseen
 from endotwin.study.networks import found, network
-from endotwin.study.recipe import OTHER_LENSES, ROTATION_DEG, TRANSLATION_MM, Recipe
+from endotwin.study.recipe import OTHER_LENSES, RENDERED, ROTATION_DEG, TRANSLATION_MM, Recipe
 from endotwin.study.train import LOSSES, Course, train
 from endotwin.tradeoff.run import PARTIAL, machine
 from endotwin.twin import Twin
@@ -184,6 +184,7 @@ class _Experiment:
             "tests": [str(sequence.path.resolve()) for sequence in self.tests],
             "checksums": self.sums,
             "network": self.network,
+            "rendered": RENDERED.vary,
             "frames": self.plan.frames,
             "steps": self.steps,
             "loss": self.plan.loss,
