@@ -129,7 +129,7 @@ def _ingredients(axes: Axes, findings: Findings) -> None:
             label = name if place == 0 else None
             axes.barh(at, percent, 0.9 * height, color=color, label=label, xerr=error, error_kw={"lw": 0.8})
     axes.axvline(0, color="#333333", lw=0.8)
-    axes.set_yticks(range(len(arms)), [*(arm.name for arm in others), "rendered: poses+lens"])
+    axes.set_yticks(range(len(arms)), [*(arm.name for arm in others), "rendered: poses+hue+lens"])
     axes.invert_yaxis()
     axes.legend(frameon=False, fontsize=8, loc="lower right")
     axes.set(xlabel="change of AbsRel against novel poses alone (%)", title="Ingredients")
