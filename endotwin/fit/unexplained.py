@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 import torch
+from scipy.ndimage import labeled_comprehension
 from torch import Tensor
 
 from endotwin.effects import Decision
@@ -55,16 +55,12 @@ class Remains:
         judged = (shown > MIDDLE[0]) & (shown < MIDDLE[1])
         photo = np.maximum(samples.color.numpy(), 0.5) * LEVEL
         log_ratio = np.log(photo / shown.clip(*MIDDLE))
-        row, count = samples.views.row(samples.frame), len(samples.views.frames)
-        order = np.argsort(row, kind="stable")
-        ends = np.searchsorted(row[order], np.arange(count + 1))
-        casts = np.full((count, 3), np.nan)
-        for frame, (first, end) in enumerate(pairwise(ends)):
-            some = order[first:end]
-            for channel in range(3):
-                if (usable := judged[some, channel]).any():
-                    casts[frame, channel] = np.median(log_ratio[some[usable], channel])
-        return cls(sigma, casts, samples.views.frames)
+        row, rows = samples.views.row(samples.frame), np.arange(len(samples.views.frames))
+        casts = [
+            labeled_comprehension(log_ratio[some, channel], row[some], rows, np.median, np.float64, np.nan)
+            for channel, some in enumerate(judged.T)
+        ]
+        return cls(sigma, np.stack(casts, axis=1), samples.views.frames)
 
 
 def cast_warning(remains: Remains) -> str | None:

@@ -15,6 +15,7 @@ from matplotlib.axes import Axes
 
 from endotwin.study.accuracy import EDGES_MM
 from endotwin.study.arms import HEADLINE
+from endotwin.study.recipe import HELPED
 from endotwin.tradeoff.plot import KNOB_COLORS, STYLE
 
 if TYPE_CHECKING:
@@ -129,9 +130,10 @@ def _ingredients(axes: Axes, findings: Findings) -> None:
             label = name if place == 0 else None
             axes.barh(at, percent, 0.9 * height, color=color, label=label, xerr=error, error_kw={"lw": 0.8})
     axes.axvline(0, color="#333333", lw=0.8)
-    axes.set_yticks(range(len(arms)), [*(arm.name for arm in others), "rendered: poses+hue+lens"])
+    helped = "+".join(recipe.name for recipe in HELPED)
+    axes.set_yticks(range(len(arms)), [*(arm.name for arm in others), f"rendered: {helped}"])
     axes.invert_yaxis()
-    axes.legend(frameon=False, fontsize=8, loc="lower right")
+    axes.legend(frameon=False, fontsize=8)
     axes.set(xlabel="change of AbsRel against novel poses alone (%)", title="Ingredients")
 
 

@@ -92,7 +92,8 @@ def merged(name: str, recipes: tuple[Recipe, ...]) -> Recipe:
     return Recipe(name, words, vary, codec, any(recipe.lenses for recipe in recipes))
 
 
-RENDERED = merged("rendered", (POSES, HUE, LENS))
+HELPED = (POSES, HUE, LENS)
+RENDERED = merged("rendered", HELPED)
 """What stands for endotwin's datasets: what helped (docs/study.md)."""
 
 EVERYTHING = merged("everything", (POSES, *INGREDIENTS))
