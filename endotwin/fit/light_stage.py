@@ -17,6 +17,7 @@ from endotwin.effects.tone import Tone
 from endotwin.evidence.coat import judged as judged_coat
 from endotwin.evidence.tone import Hues, steadied
 from endotwin.evidence.tone import judged as judged_tone
+from endotwin.fit.faint import Faint
 from endotwin.fit.gauss_newton import (
     GaussNewton,
     State,
@@ -29,7 +30,7 @@ from endotwin.fit.gauss_newton import (
 from endotwin.fit.hashgrid import HashGrid, HashOperator
 from endotwin.fit.lighting import Relighting
 from endotwin.fit.model import Globals, at_pixels
-from endotwin.fit.within import Renewed, Varied, Within
+from endotwin.fit.within import Renewed, Within
 from endotwin.light.shading import F0_DIELECTRIC, ROUGHNESS_TISSUE
 from endotwin.pixels.length_unit import unit_mm
 from endotwin.pixels.pace import LIGHT, Pace
@@ -59,8 +60,11 @@ off a mesh errs by would bend it, and γ with it. L0 is told by the albedo's sca
 WORSE, HALVINGS = 1.25, 2
 """A step under whose light the photos cost so many times what they did is too long, and halved so often."""
 
-SETTLING = 2
+SETTLING = 4
 """Steps of the materials under a light that was found beside a bounce."""
+
+LEAVING = 2
+"""Steps in which light and materials learn to do without what is faint."""
 
 CONVERGED = 2e-4
 """A step that changes the cost by a smaller share than this is the last."""
@@ -97,11 +101,12 @@ class FoundLight:
 
 @dataclass(frozen=True)
 class Best:
-    """A ``state``, with the ``effects`` that were found with it, that costs least under its own light, by the
-    ``noise`` at which others are held to it."""
+    """A ``state``, with the ``effects`` and what is ``faint`` that were found with it, that costs least under
+    its own light, by the ``noise`` at which others are held to it."""
 
     state: State
     effects: Effects
+    faint: Faint
     cost: float
     noise: float
 
@@ -151,6 +156,8 @@ class LightStage:
         toned = self._in_one_step() if self._relighting.bounces else None
         if not self._relighting.bounces:
             toned = self._in_turns()
+        if toned is None and self._relighting.faint.found:
+            self._without_faint()
         hurried = Decision("off", "no time to judge")
         decisions = dict.fromkeys(self._wanted, hurried) | self._decisions
         return FoundLight(self._state, self._cost, decisions, toned)
@@ -204,14 +211,14 @@ class LightStage:
         for as long as all pixels say that it is better: coarse albedo bends γ, and what a video processor
         does to colours bends what varies."""
         held = (*self._undetermined, *BOUNCE_HELD, "albedo scale")
-        varied = Varied(self._relighting.varied.frames)
         self._take_best(best)
         for _ in range(STEPS):
             if self._pace.light_is_over():
                 break
             within, material = self._within()
+            varied = replace(self._relighting.varied, aside=None, guides=0)
             found = within.renewed(material, self._state.shared, held, best.noise, varied)
-            self._relighting.brighten(self._solver, found.log_gain)
+            self._relighting.vary(self._solver, found)
             self._take(found)
             for _ in range(SETTLING):
                 self._state, _ = self._stepped(self._state, joint=False)
@@ -220,6 +227,20 @@ class LightStage:
                 break
             best = newer
         return best
+
+    def _without_faint(self) -> None:
+        """The light that predicts best without what is too faint to be an effect; γ, and how light bounces,
+        stay as they were found beside it."""
+        self._relighting.expose(self._solver, self._relighting.effects)
+        bounce = (*BOUNCE_HELD, "albedo scale") if self._relighting.bounces else ()
+        held = (*self._undetermined, *bounce, "gamma")
+        for _ in range(LEAVING):
+            within, material = self._within()
+            shared, varied = self._state.shared, self._relighting.varied
+            found = within.renewed(material, shared, held, self._noise, varied)
+            self._relighting.vary(self._solver, found)
+            self._take(found)
+            self._state, _ = self._stepped(self._state, joint=False)
 
     @property
     def _late(self) -> bool:
@@ -241,7 +262,8 @@ class LightStage:
         self._state = replace(self._state, shared=found.shared, mean=mean)
 
     def _take_best(self, best: Best) -> None:
-        self._state, self._relighting.effects = best.state, best.effects
+        self._state = best.state
+        self._relighting.expose(self._solver, best.effects, best.faint)
         self._relighting(self._solver, self._state)
 
     def _next(self, number: int, steps: int, gain: float, coat_step: int) -> int:
@@ -291,7 +313,7 @@ class LightStage:
         cost = self._solver.cost(state, noise)
         if best is not None and best.cost <= cost:
             return best
-        return Best(state, self._relighting.effects, cost, noise)
+        return Best(state, self._relighting.effects, self._relighting.faint, cost, noise)
 
     def _stepped(self, state: State, joint: bool) -> tuple[State, float]:
         """A step, of the materials alone where a ``joint`` one finds nothing lower, with the samples relit by

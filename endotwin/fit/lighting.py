@@ -14,6 +14,7 @@ from torch import Tensor
 from endotwin.effects import Effects
 from endotwin.effects.gain import Gain
 from endotwin.effects.offset import Offset
+from endotwin.fit.faint import NOTHING, Faint
 from endotwin.fit.gauss_newton import HUBER, MOST_GAIN_STEP, GaussNewton, State
 from endotwin.fit.model import Globals, at_pixels, slope_by_log_exposure
 from endotwin.fit.normal_equations import CHUNK, Residual
@@ -92,10 +93,12 @@ def guides_aside(samples: Samples, surface: Surface, effects: Effects, step_mm: 
 class Relighting:
     """What of the light depends on the materials, renewed as the fit finds them."""
 
-    def __init__(self, surface: Surface, caster: Caster, effects: Effects, views: Views):
+    def __init__(
+        self, surface: Surface, caster: Caster, effects: Effects, views: Views, faint: Faint = NOTHING
+    ):
         if "gain" in effects:
             effects = effects.including(effects["gain"].at(views.frames))
-        self.effects = effects
+        self.effects, self.faint = effects, faint
         self._surface, self._caster = surface, caster
         self._bouncer = Bouncer(surface, caster, effects, views) if effects.bounce else None
 
@@ -113,17 +116,21 @@ class Relighting:
         these the probe has found them better than shading can."""
         frames = len(self.effects["gain"].frames) if "gain" in self.effects else 0
         if self.effects.guides_mm is None or "shadows" in self.effects:
-            return Varied(frames)
+            return Varied(frames, faint=self.faint)
 
         def aside(samples: Samples, step_mm: float) -> Iterator[Samples]:
             return guides_aside(samples, self._surface, self.effects, step_mm)
 
-        return Varied(frames, aside, len(self.effects.guides_mm))
+        return Varied(frames, aside, len(self.effects.guides_mm), self.faint)
 
     def vary(self, solver: GaussNewton, found: Renewed) -> None:
-        """Gains and guides as a step has ``found`` them, and the samples of ``solver`` lit so."""
+        """Gains, guides and faint effects as a step has ``found`` them, and the samples of ``solver`` lit
+        so."""
         self.brighten(solver, found.log_gain)
         samples = solver.samples
+        if found.faint.any():
+            self.faint = self.faint.with_more(found.faint)
+            samples = self._exposed(samples)
         if len(found.aside_mm):
             guides_mm = np.asarray(self.effects.guides_mm) + found.aside_mm
             guides_mm[:, 2] = np.minimum(guides_mm[:, 2], 0)
@@ -136,7 +143,21 @@ class Relighting:
         """Frames brighter by ``log_gain`` [F], or as they are by [0], and the samples of ``solver`` so."""
         if len(log_gain):
             self.effects = _brightened(self.effects, log_gain)
-            solver.relight(exposed(solver.samples, self.effects))
+            solver.relight(self._exposed(solver.samples))
+
+    def expose(self, solver: GaussNewton, effects: Effects, faint: Faint = NOTHING) -> None:
+        """The samples of ``solver`` with the gain and vignetting of ``effects`` and what is ``faint``, which
+        hold from here on."""
+        self.effects, self.faint = effects, faint
+        solver.relight(self._exposed(solver.samples))
+
+    def _exposed(self, samples: Samples) -> Samples:
+        """``samples`` with the effects' gain and vignetting, and what is faint."""
+        samples = exposed(samples, self.effects)
+        if not self.faint.found:
+            return samples
+        log_exposure = torch.from_numpy(self.faint.log_exposure(samples)).float()
+        return replace(samples, log_exposure=samples.log_exposure + log_exposure)
 
     def guided(self, samples: Samples) -> Samples:
         """``samples`` lit by the guides where they were found last."""
@@ -161,9 +182,9 @@ class Relighting:
         return self._bouncer.bounced(samples, roughness, materials, triangles, state.shared)
 
     def relit(self, samples: Samples, triangles: Tensor, state: State) -> Samples:
-        """``bounced``, and with the gain that was found last."""
+        """``bounced``, and with the gain and what is faint as they were found last."""
         samples = self.bounced(samples, triangles, state)
-        return exposed(samples, self.effects) if "gain" in self.effects else samples
+        return self._exposed(samples) if "gain" in self.effects or self.faint.found else samples
 
     def __call__(self, solver: GaussNewton, state: State) -> None:
         """Relight the samples of ``solver`` as ``state`` says."""
@@ -173,7 +194,7 @@ class Relighting:
             width = HUBER * solver.noise(state)
             material = at_pixels(samples, solver.triangles, state.materials)
             self.effects = regained(samples, material, state.shared, self.effects, width)
-            samples = exposed(samples, self.effects)
+            samples = self._exposed(samples)
         if self.needed:
             solver.relight(samples)
 

@@ -27,6 +27,7 @@ from endotwin.effects.coat import Coat
 from endotwin.effects.tone import Tone, bend
 from endotwin.evidence.coat import LEAST_SIGHTINGS, Highlights
 from endotwin.evidence.tone import Hues
+from endotwin.fit.faint import NOTHING, Faint
 from endotwin.fit.gauss_newton import (
     F0,
     ROUGHNESS_LOGIT_SPREAD,
@@ -43,7 +44,7 @@ from endotwin.pixels.samples import Samples
 from endotwin.pixels.start import BRIGHT, DARK, DIFFUSE_SIN2
 from endotwin.surface import Surface
 
-SCALE = BOUNCE_GLOBALS.index("ln albedo scale")
+LEVEL, SCALE = (BOUNCE_GLOBALS.index(name) for name in ("gamma·ln L0", "ln albedo scale"))
 
 DARKEST = 0.03
 """Display value of the prediction below which noise rules the logarithm."""
@@ -66,6 +67,11 @@ HUE_PIXELS = 100_000
 HIGHLIGHT_PIXELS = 30_000
 """Of the highlights, all of some vertices; more would not change the mind about a coat."""
 
+FAINT_RIDGE = 0.001
+"""What a model lacks errs alike in many pixels: all are worth some thousands that err each for itself. And a
+faint effect shows by half of the noise at most, since more would be decided. So much of what pixels say of it
+says that it is 0, and none is found that light and response nearly pass for."""
+
 REWEIGHTS = 4
 
 ASIDE = 0.005
@@ -84,11 +90,13 @@ class Varied:
         aside: samples, and mm, to the same ones lit by guides moved so far: each in turn, along x, then
             y and z; None: they stay, or the light is at the lens.
         guides: how many there are.
+        faint: effects that may be there.
     """
 
     frames: int = 0
     aside: Callable[[Samples, float], Iterator[Samples]] | None = None
     guides: int = 0
+    faint: Faint = NOTHING
 
 
 STILL = Varied()
@@ -97,12 +105,14 @@ STILL = Varied()
 @dataclass(frozen=True)
 class Renewed:
     """What a step has found: ``shared``, and what it adds to ln of each frame's gain, float64 [frames], to
-    the guides' places, float64 [guides, 3], mm, and to the logit of all roughness."""
+    the guides' places, float64 [guides, 3], mm, to the logit of all roughness, and to the coefficients of
+    faint effects, float64 [K]."""
 
     shared: Globals
     log_gain: np.ndarray = field(default_factory=lambda: np.zeros(0))
     aside_mm: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
     roughness: float = 0.0
+    faint: np.ndarray = field(default_factory=lambda: np.zeros(0))
 
 
 @dataclass(frozen=True)
@@ -112,8 +122,8 @@ class Sightings:
     Attributes:
         vertex, frame: int [S]. residual: ln photo − ln prediction [S]. slopes: d ln C by the shared
             parameters [S, G]. by_roughness: d ln C by the logit of roughness [S]. by_coat: d ln C by the
-            coat's weight [S], 0 without one. by_guides: d ln C by the guides' places, 1/mm [S, 3K]. weight:
-            inverse variance [S].
+            coat's weight [S], 0 without one. by_varied: d ln C by what is ``Varied`` beside gains: the
+            guides' places, 1/mm, and coefficients of faint effects [S, V]. weight: inverse variance [S].
     """
 
     vertex: np.ndarray
@@ -122,7 +132,7 @@ class Sightings:
     slopes: np.ndarray
     by_roughness: np.ndarray
     by_coat: np.ndarray
-    by_guides: np.ndarray
+    by_varied: np.ndarray
     weight: np.ndarray
 
     def beside(self, other: Sightings) -> Sightings:
@@ -245,16 +255,20 @@ class Within:
         if not free.shape[1] or len(seen.residual) < LEAST_SIGHTINGS:
             return Renewed(shared, np.zeros(varied.frames), np.zeros((varied.guides, 3)))
         diffuse = "f0" in held
-        places = self.count
+        places, extra = self.count, seen.by_varied.shape[1]
         if diffuse and shared.bounces:
-            seen, places = seen.beside(self._ratios(material, shared, chosen, noise)), 3 * places
+            seen, places = seen.beside(self._ratios(material, shared, chosen, noise, extra)), 3 * places
         frame = np.searchsorted(self.samples.views.frames, seen.frame) if varied.frames else None
         coated = not diffuse and shared.coat is not None
-        columns, prior = self._columns(seen, shared, free, diffuse, coated)
-        design = Design(columns, seen.vertex, places, frame, seen.weight, prior)
-        found = regress(seen.residual, design, varied.frames, rounds=REWEIGHTS)
-        count, guides = free.shape[1], seen.by_guides.shape[1]
-        along, aside_mm, shine = np.split(found.coefficients, [count, count + guides])
+        columns, prior = self._columns(seen, shared, free, varied, diffuse, coated)
+        faint, ends = varied.faint.coefficients, np.cumsum([free.shape[1], 3 * varied.guides])
+        ends = [*ends, ends[1] + len(faint)]
+        ridge = np.zeros(columns.shape[1])
+        ridge[slice(*ends[1:])] = FAINT_RIDGE
+        target = seen.residual + columns[:, slice(*ends[1:])] @ faint
+        design = Design(columns, seen.vertex, places, frame, seen.weight, prior, ridge)
+        found = regress(target, design, varied.frames, rounds=REWEIGHTS)
+        along, aside_mm, fainter, shine = np.split(found.coefficients, ends)
         along, (rougher, wetter) = free @ along, shine if coated else (0.0, 0.0)
         spread = np.r_[global_prior(self.unit_mm, len(shared.vector))[1].numpy(), ROUGHNESS_LOGIT_SPREAD]
         length = min(1.0, float((spread / np.maximum(np.abs(np.r_[along, rougher]), 1e-12)).min()))
@@ -263,21 +277,21 @@ class Within:
             shared = replace(shared, coat=replace(shared.coat, weight=weight))
         log_gain = found.intercepts / shared.gamma if varied.frames else np.zeros(0)
         moved = bounded(shared, shared.vector + torch.from_numpy(length * along))
-        return Renewed(moved, length * log_gain, length * aside_mm.reshape(-1, 3), length * float(rougher))
+        aside_mm, fainter = length * aside_mm.reshape(-1, 3), length * (fainter - faint)
+        return Renewed(moved, length * log_gain, aside_mm, length * float(rougher), fainter)
 
     def _columns(
-        self, seen: Sightings, shared: Globals, free: np.ndarray, diffuse: bool, coated: bool
+        self, seen: Sightings, shared: Globals, free: np.ndarray, varied: Varied, diffuse: bool, coated: bool
     ) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]:
-        """Columns of the ``free`` directions, of the guides' places, of roughness where light is ``diffuse``
-        or a coat is sought, and then of its weight; and what is known of their coefficients."""
+        """Columns of the ``free`` directions, of what is varied, first of guides' places, of
+        roughness where light is ``diffuse`` or a coat is sought, and then of its weight; and what is known of
+        their coefficients."""
         mean, spread = (x.numpy() for x in global_prior(self.unit_mm, len(shared.vector)))
-        guides = seen.by_guides.shape[1]
-        parts = [
-            free.T @ np.diag(TEMPER / spread**2) @ free,
-            np.eye(guides) * TEMPER / (ASIDE_SPREAD * self.distance_mm) ** 2,
-        ]
-        pulls = [free.T @ (TEMPER * (mean - shared.vector.numpy()) / spread**2), np.zeros(guides)]
-        columns = [seen.slopes @ free, seen.by_guides]
+        known = np.zeros(seen.by_varied.shape[1])
+        known[: 3 * varied.guides] = TEMPER / (ASIDE_SPREAD * self.distance_mm) ** 2
+        parts = [free.T @ np.diag(TEMPER / spread**2) @ free, np.diag(known)]
+        pulls = [free.T @ (TEMPER * (mean - shared.vector.numpy()) / spread**2), 0 * known]
+        columns = [seen.slopes @ free, seen.by_varied]
         if diffuse or coated:
             columns.append(seen.by_roughness[:, None])
             parts.append([[TEMPER / ROUGHNESS_LOGIT_SPREAD**2]])
@@ -327,15 +341,20 @@ class Within:
         by_guides = (
             self._by_guides(rows, material, shared, varied, model.predicted[bright], tells) / predicted
         )
+        shapes = varied.faint.shapes(self.samples)[rows.numpy()].T
+        by_faint = shared.gamma * slopes[:, LEVEL] * shapes
         by_raw = roughness_slope(material[rows, 3])[:, None]
         by_roughness = (model.by_roughness[bright] * by_raw * tells).mean(dim=1).numpy() / predicted
         weight = 1 / ((noise / predicted) ** 2 + MODEL_ERROR**2)
-        columns = (residual, by_roughness, by_coat, *slopes.T, *by_guides)
+        columns = (residual, by_roughness, by_coat, *slopes.T, *by_guides, *by_faint)
         return self._gathered(rows, columns, weight, slopes.shape[1])
 
-    def _ratios(self, material: Tensor, shared: Globals, chosen: Tensor, noise: float) -> Sightings:
+    def _ratios(
+        self, material: Tensor, shared: Globals, chosen: Tensor, noise: float, varied: int
+    ) -> Sightings:
         """Sightings of the RATIOS of channels of the ``chosen`` samples in which none is dark or clipped, as
-        vertices of their own; no gain changes them: they are of the first frame."""
+        vertices of their own; no gain changes them, nor what else is ``varied``: they are of the first
+        frame."""
         rows, shown = self._coloured(chosen), self.samples.color
         model = linearise(self.samples[rows], material[rows], shared)
         bright = (model.predicted > DARKEST).all(dim=1)
@@ -351,17 +370,19 @@ class Within:
             variance = (noise / predicted) ** 2 @ ratio**2 + RATIO_ERROR**2
             each = self._gathered(rows, (*columns, *by_shared), 1 / variance.numpy(), len(by_shared))
             first = np.full_like(each.frame, self.samples.views.frames[0])
-            found.append(replace(each, vertex=each.vertex + number * self.count, frame=first))
+            same = np.zeros((len(first), varied))
+            vertex = each.vertex + number * self.count
+            found.append(replace(each, vertex=vertex, frame=first, by_varied=same))
         return found[0].beside(found[1])
 
     def _gathered(
         self, rows: Tensor, columns: tuple[np.ndarray, ...], weight: np.ndarray, count: int
     ) -> Sightings:
         """Sightings of samples ``rows``: means of residual, slopes by roughness and coat, by ``count`` shared
-        parameters and by guides, each [R]."""
+        parameters and by what is varied, each [R]."""
         vertex, frame, *means, total = self._means(rows, columns, weight)
-        slopes, by_guides = np.split(np.stack(means[3:], axis=1), [count], axis=1)
-        return Sightings(vertex, frame, means[0], slopes, *means[1:3], by_guides, total)
+        slopes, by_varied = np.split(np.stack(means[3:], axis=1), [count], axis=1)
+        return Sightings(vertex, frame, means[0], slopes, *means[1:3], by_varied, total)
 
     def _means(self, rows: Tensor, columns: tuple[np.ndarray, ...], weight: np.ndarray) -> list[np.ndarray]:
         """Vertex, frame, means of the ``columns`` and sum of the weights of what the samples ``rows`` [R]

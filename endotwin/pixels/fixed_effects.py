@@ -31,6 +31,7 @@ class Design:
         weight: [N], inverse variances up to one factor; None: all alike.
         prior: precision [C, C] and pull [C] of the coefficients, beside values of variance 1 / weight; None:
         nothing is known of them.
+        ridge: [C], that a coefficient is 0 is told by this share of what values tell of it alone; None: 0.
     """
 
     columns: np.ndarray
@@ -39,10 +40,12 @@ class Design:
     category: np.ndarray | None = None
     weight: np.ndarray | None = None
     prior: tuple[np.ndarray, np.ndarray] | None = None
+    ridge: np.ndarray | None = None
 
     def __getitem__(self, rows: np.ndarray) -> Design:
         category, weight = (None if x is None else x[rows] for x in (self.category, self.weight))
-        return Design(self.columns[rows], self.group[rows], self.count, category, weight, self.prior)
+        columns, group = self.columns[rows], self.group[rows]
+        return Design(columns, group, self.count, category, weight, self.prior, self.ridge)
 
     def explained(self, found: FixedEffects) -> np.ndarray:
         """The values [N] without the groups' intercepts."""
@@ -78,6 +81,8 @@ def regress(target: np.ndarray, design: Design, categories: int = 0, rounds: int
         within = without_means(np.c_[design.columns, target], weight, group, count)
         normal, right = _normal_equations(within, weight, design, categories)
         normal[np.diag_indices_from(normal)] += RIDGE * np.trace(normal) + 1e-12
+        if design.ridge is not None:
+            normal[np.diag_indices(slopes)] *= 1 + design.ridge
         if design.prior is not None:
             precision, pull = design.prior
             normal[:slopes, :slopes] += width**2 * precision
