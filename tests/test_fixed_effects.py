@@ -1,5 +1,7 @@
 """Regression with an intercept a group, against NumPy's least squares with a column for each."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -28,6 +30,18 @@ def test_a_round_is_least_squares_with_a_column_for_every_group_and_category(cou
     solved = np.linalg.lstsq(full, target * root)[0]
     np.testing.assert_allclose(found.coefficients, solved[:3], atol=1e-6)
     np.testing.assert_allclose(found.intercepts, np.r_[0, solved[3 + groups :]], atol=5e-5)  # by the ridge
+
+
+def test_a_ridge_is_a_value_of_0_for_a_share_of_what_the_values_tell_of_a_coefficient():
+    target, design = made(200, 10, 4)
+    design = replace(design, category=None, ridge=np.array([0.0, 0.5, 0.0]))
+    within = without_means(design.columns, design.weight, design.group, design.count)
+    root = np.sqrt(design.weight)
+    told = np.linalg.norm(within[:, 1] * root)
+    rows = np.vstack([within * root[:, None], [0, np.sqrt(0.5) * told, 0]])
+    found = regress(target, design, rounds=1).coefficients
+    np.testing.assert_allclose(found, np.linalg.lstsq(rows, np.r_[target * root, 0])[0], atol=1e-6)
+    assert abs(found[1]) < 0.7 * 2
 
 
 def test_outliers_bend_a_robust_regression_by_less_than_their_share():

@@ -72,6 +72,8 @@ class Faint:
 
     def shapes(self, samples: Samples) -> np.ndarray:
         """The shapes at samples, float64 [N, K]; kept for those asked of last, whatever lights them."""
+        if not (self.vignetting or self.offset):
+            return np.zeros((len(samples), 0))
         kept = vars(self).get("_kept")
         if kept is None or kept[0] is not samples.pixel:
             kept = samples.pixel, self._shapes(samples)
@@ -84,8 +86,7 @@ class Faint:
             shapes.append(VIGNETTING * squared_radius(samples.views.camera, samples.pixel.numpy()))
         if self.offset:
             shapes += self._aside(samples.points_mm, samples.normals(self.surface))
-        none = np.zeros((len(samples), 0))
-        return np.stack(shapes, axis=1, dtype=np.float64) - self.mean if shapes else none
+        return np.stack(shapes, axis=1, dtype=np.float64) - self.mean
 
     def log_exposure(self, samples: Samples) -> np.ndarray:
         """ln of the factor on samples, float64 [N]."""

@@ -235,6 +235,8 @@ class LightStage:
         bounce = (*BOUNCE_HELD, "albedo scale") if self._relighting.bounces else ()
         held = (*self._undetermined, *bounce, "gamma")
         for _ in range(LEAVING):
+            if self._late:
+                break
             within, material = self._within()
             shared, varied = self._state.shared, self._relighting.varied
             found = within.renewed(material, shared, held, self._noise, varied)

@@ -261,9 +261,8 @@ class Within:
         frame = np.searchsorted(self.samples.views.frames, seen.frame) if varied.frames else None
         coated = not diffuse and shared.coat is not None
         columns, prior = self._columns(seen, shared, free, varied, diffuse, coated)
-        faint, ends = varied.faint.coefficients, np.cumsum([free.shape[1], 3 * varied.guides])
-        ends = [*ends, ends[1] + len(faint)]
-        ridge = np.zeros(columns.shape[1])
+        faint, ridge = varied.faint.coefficients, np.zeros(columns.shape[1])
+        ends = np.cumsum([free.shape[1], 3 * varied.guides, len(faint)])
         ridge[slice(*ends[1:])] = FAINT_RIDGE
         target = seen.residual + columns[:, slice(*ends[1:])] @ faint
         design = Design(columns, seen.vertex, places, frame, seen.weight, prior, ridge)
@@ -283,9 +282,9 @@ class Within:
     def _columns(
         self, seen: Sightings, shared: Globals, free: np.ndarray, varied: Varied, diffuse: bool, coated: bool
     ) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]:
-        """Columns of the ``free`` directions, of what is varied, first of guides' places, of
-        roughness where light is ``diffuse`` or a coat is sought, and then of its weight; and what is known of
-        their coefficients."""
+        """Columns of the ``free`` directions, of what is ``varied`` (guides' places first), of roughness where
+        light is ``diffuse`` or a coat is sought, and then of its weight; and what is known of their
+        coefficients."""
         mean, spread = (x.numpy() for x in global_prior(self.unit_mm, len(shared.vector)))
         known = np.zeros(seen.by_varied.shape[1])
         known[: 3 * varied.guides] = TEMPER / (ASIDE_SPREAD * self.distance_mm) ** 2
