@@ -20,10 +20,10 @@ from endotwin.pixels.samples import Samples
 from endotwin.pixels.start import COS_MIN, PRIOR
 from endotwin.surface import Surface
 
-VIGNETTING = 0.2
-"""k2 of the shape."""
+VIGNETTING = 0.8
+"""k2 of the shape: a lens that passes 45 % at the middle of the longer border."""
 
-ASIDE_MM = 3.0
+ASIDE_MM = 6.0
 """Guides of the shapes end so far beside the lens, all to one side of it or all around."""
 
 MOST = 1.0
@@ -39,7 +39,7 @@ class Faint:
             their mean place along x and y changes, and the mean square of how far they stand from it.
         surface: that is looked at. unit_mm: its unit of length.
         mean: float64 [K], of the shapes over what is looked at: what they change is no light's strength.
-        coefficients: float64 [K], of the shapes.
+        coefficients: float64 [K], of the shapes: within ±1, or no endoscope has them.
     """
 
     vignetting: bool = False
@@ -63,6 +63,11 @@ class Faint:
     def found(self) -> bool:
         """Whether there is any."""
         return bool(self.coefficients.any())
+
+    @property
+    def possible(self) -> bool:
+        """Whether an endoscope may have it; else the model lacks something that is not faint."""
+        return bool((np.abs(self.coefficients) <= 1).all())
 
     def with_more(self, coefficients: np.ndarray) -> Faint:
         """The same with ``coefficients`` [K] added."""

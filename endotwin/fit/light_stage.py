@@ -171,11 +171,8 @@ class LightStage:
                 break
             if (toned := self._newly_toned(number, COAT_STEP)) is not None:
                 return toned
-            shared = self._judged(number, COAT_STEP)
-            within, material = self._within()
-            found = within.renewed(material, shared, self._undetermined, self._noise, self._relighting.varied)
-            self._relighting.vary(self._solver, found)
-            self._take(found)
+            self._state = replace(self._state, shared=self._judged(number, COAT_STEP))
+            self._renew(self._undetermined, self._noise)
             if late:
                 break
             self._state, gain = self._stepped(self._state, joint=False)
@@ -215,11 +212,7 @@ class LightStage:
         for _ in range(STEPS):
             if self._pace.light_is_over():
                 break
-            within, material = self._within()
-            varied = replace(self._relighting.varied, aside=None, guides=0)
-            found = within.renewed(material, self._state.shared, held, best.noise, varied)
-            self._relighting.vary(self._solver, found)
-            self._take(found)
+            self._renew(held, best.noise)
             for _ in range(SETTLING):
                 self._state, _ = self._stepped(self._state, joint=False)
             newer = self._better(best, self._state)
@@ -237,12 +230,24 @@ class LightStage:
         for _ in range(LEAVING):
             if self._late:
                 break
-            within, material = self._within()
-            shared, varied = self._state.shared, self._relighting.varied
-            found = within.renewed(material, shared, held, self._noise, varied)
-            self._relighting.vary(self._solver, found)
-            self._take(found)
+            self._renew(held, self._noise)
             self._state, _ = self._stepped(self._state, joint=False)
+
+    def _renew(self, held: tuple[str, ...], noise: float) -> None:
+        """Light, response and what may vary with them, by what varies within vertices; guides stay beside a
+        bounce. Where no endoscope has what would be faint, nothing is."""
+        relighting = self._relighting
+        within, material = self._within()
+        varied = relighting.varied
+        if relighting.bounces:
+            varied = replace(varied, aside=None, guides=0)
+        found = within.renewed(material, self._state.shared, held, noise, varied)
+        if len(found.faint) and not relighting.faint.with_more(found.faint).possible:
+            relighting.expose(self._solver, relighting.effects)
+            self._renew(held, noise)
+            return
+        relighting.vary(self._solver, found)
+        self._take(found)
 
     @property
     def _late(self) -> bool:

@@ -282,8 +282,8 @@ class Within:
     def _columns(
         self, seen: Sightings, shared: Globals, free: np.ndarray, varied: Varied, diffuse: bool, coated: bool
     ) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]:
-        """Columns of the ``free`` directions, of what is ``varied`` (guides' places first), of roughness where
-        light is ``diffuse`` or a coat is sought, and then of its weight; and what is known of their
+        """Columns of the ``free`` directions, of what is ``varied``, first of guides' places, of roughness
+        where light is ``diffuse`` or a coat is sought, and then of its weight; and what is known of their
         coefficients."""
         mean, spread = (x.numpy() for x in global_prior(self.unit_mm, len(shared.vector)))
         known = np.zeros(seen.by_varied.shape[1])
