@@ -152,10 +152,11 @@ class Relighting:
         solver.relight(self._exposed(solver.samples))
 
     def _exposed(self, samples: Samples) -> Samples:
-        """``samples`` with the effects' gain and vignetting, and what is faint."""
-        samples = exposed(samples, self.effects)
+        """``samples`` with the effects' gain and vignetting, and what is faint; with none if all are off."""
         if not self.faint.found:
-            return samples
+            dims = "gain" in self.effects or "vignetting" in self.effects
+            return exposed(samples, self.effects) if dims else replace(samples, log_exposure=None)
+        samples = exposed(samples, self.effects)
         log_exposure = torch.from_numpy(self.faint.log_exposure(samples)).float()
         return replace(samples, log_exposure=samples.log_exposure + log_exposure)
 
@@ -167,7 +168,7 @@ class Relighting:
 
     def without_bounce(self, solver: GaussNewton, state: State) -> State:
         """From here on no light bounces: the photos show none. ``state`` as if there had never been any."""
-        self._bouncer = None
+        self._bouncer, self.faint = None, NOTHING
         self.effects = self.effects.including(replace(self.effects["interreflection"], strength=0.0))
         solver.relight(replace(solver.samples, bounce=None))
         return replace(state, shared=state.shared.without_scale())

@@ -21,7 +21,7 @@ from endotwin.errors import SequenceError
 from endotwin.evidence.decide import Decided, decide
 from endotwin.evidence.glints import Glints
 from endotwin.fit.bloom import bloom
-from endotwin.fit.faint import Faint
+from endotwin.fit.faint import NOTHING, Faint
 from endotwin.fit.film import Found, Model
 from endotwin.fit.gauss_newton import CPU, GaussNewton, State, unusual
 from endotwin.fit.hashgrid import HashGrid, HashOperator
@@ -86,15 +86,14 @@ def fit_twin(
     with stopwatch.stage("start"):
         pixels = _Pixels.of(samples, twin, pace, seed)
         start = closed_form(samples[pixels.start], surface.triangles, len(surface.vertices_mm))
+    if start.undetermined:
+        logger.warning("the photos cannot tell %s: kept at the prior", " and ".join(start.undetermined))
     caster = caster.threaded(THREADS)
     lighted = _find_light(pixels, twin, caster, start, pace, states, device)
     began = stopwatch.total
     if lighted.found.toned is not None:
         lighted = _find_light(pixels, twin, caster, start, pace, states, device, lighted)
     again_s = stopwatch.total - began
-    untold = lighted.start.undetermined
-    if untold:
-        logger.warning("the photos cannot tell %s: kept at the prior", " and ".join(untold))
     relighting, samples, state = lighted.relighting, lighted.samples, lighted.found.state
     with stopwatch.stage("detail"):
         samples = relighting.guided(samples)
@@ -123,7 +122,9 @@ def fit_twin(
         for effect in beyond:
             effects = effects.including(effect)
         fitted = price(_fitted(twin, wet.model.state, effects, decisions, wet.film), caster, samples.views)
-    return fitted.with_record(fit={"method": "twin", "undetermined": list(untold), **stopwatch.to_dict()})
+    return fitted.with_record(
+        fit={"method": "twin", "undetermined": list(lighted.start.undetermined), **stopwatch.to_dict()}
+    )
 
 
 def _warn(remains: Remains, twin: Twin, decisions: Mapping[str, Decision]) -> None:
@@ -211,7 +212,9 @@ def _find_light(
 
         late, telling = pace.light_is_over, shown[pixels.telling]
         decided = decide(telling, twin, caster, glints, states, late, near_mm or AT_LENS)
-        faint = Faint.beside(decided.effects, states, shown[pixels.light], surface)
+        faint = NOTHING
+        if decided.effects.bounce:
+            faint = Faint.beside(decided.effects, states, shown[pixels.light], surface)
         relighting = Relighting(surface, caster, decided.effects, samples.views, faint)
         if decided.light is not None:
             start = start_at(shown[pixels.start], *mesh, decided.light, decided.gamma)
