@@ -225,8 +225,7 @@ class LightStage:
         """The light that predicts best without what is too faint to be an effect; γ, and how light bounces,
         stay as they were found beside it."""
         self._relighting.expose(self._solver, self._relighting.effects)
-        bounce = (*BOUNCE_HELD, "albedo scale") if self._relighting.bounces else ()
-        held = (*self._undetermined, *bounce, "gamma")
+        held = (*self._undetermined, *BOUNCE_HELD, "albedo scale", "gamma")
         for _ in range(LEAVING):
             if self._late:
                 break
