@@ -156,8 +156,6 @@ class LightStage:
         toned = self._in_one_step() if self._relighting.bounces else None
         if not self._relighting.bounces:
             toned = self._in_turns()
-        if toned is None and self._relighting.faint.found:
-            self._without_faint()
         hurried = Decision("off", "no time to judge")
         decisions = dict.fromkeys(self._wanted, hurried) | self._decisions
         return FoundLight(self._state, self._cost, decisions, toned)
@@ -171,8 +169,8 @@ class LightStage:
                 break
             if (toned := self._newly_toned(number, COAT_STEP)) is not None:
                 return toned
-            self._state = replace(self._state, shared=self._judged(number, COAT_STEP))
-            self._renew(self._undetermined, self._noise)
+            shared = self._judged(number, COAT_STEP)
+            self._renew(shared, self._undetermined, self._noise)
             if late:
                 break
             self._state, gain = self._stepped(self._state, joint=False)
@@ -201,6 +199,8 @@ class LightStage:
             number = self._next(number, BOUNCE_STEPS, gain, BOUNCE_COAT_STEP)
         if best is not None:
             self._take_best(self._by_what_varies(best))
+        if self._relighting.faint.found:
+            self._without_faint()
         return None
 
     def _by_what_varies(self, best: Best) -> Best:
@@ -212,7 +212,7 @@ class LightStage:
         for _ in range(STEPS):
             if self._pace.light_is_over():
                 break
-            self._renew(held, best.noise)
+            self._renew(self._state.shared, held, best.noise)
             for _ in range(SETTLING):
                 self._state, _ = self._stepped(self._state, joint=False)
             newer = self._better(best, self._state)
@@ -229,21 +229,18 @@ class LightStage:
         for _ in range(LEAVING):
             if self._late:
                 break
-            self._renew(held, self._noise)
+            self._renew(self._state.shared, held, self._noise)
             self._state, _ = self._stepped(self._state, joint=False)
 
-    def _renew(self, held: tuple[str, ...], noise: float) -> None:
-        """Light, response and what may vary with them, by what varies within vertices; guides stay beside a
-        bounce. Where no endoscope has what would be faint, nothing is."""
+    def _renew(self, shared: Globals, held: tuple[str, ...], noise: float) -> None:
+        """Light and response, from ``shared``, and what may vary with them, by what varies within vertices.
+        Where no endoscope has what would be faint, nothing is."""
         relighting = self._relighting
         within, material = self._within()
-        varied = relighting.varied
-        if relighting.bounces:
-            varied = replace(varied, aside=None, guides=0)
-        found = within.renewed(material, self._state.shared, held, noise, varied)
+        found = within.renewed(material, shared, held, noise, relighting.varied)
         if len(found.faint) and not relighting.faint.with_more(found.faint).possible:
             relighting.expose(self._solver, relighting.effects)
-            self._renew(held, noise)
+            self._renew(shared, held, noise)
             return
         relighting.vary(self._solver, found)
         self._take(found)

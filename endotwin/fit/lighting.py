@@ -38,17 +38,17 @@ def lit(samples: Samples, surface: Surface, caster: Caster, effects: Effects) ->
     elif effects.profile != COSINE:
         axis = torch.from_numpy(log_axis(samples.log_cos_axis.exp().numpy(), effects.profile))
         samples = replace(samples, log_cos_axis=axis)
-    if "gain" in effects or "vignetting" in effects:
-        samples = exposed(samples, effects)
-    return samples
+    return exposed(samples, effects)
 
 
 def exposed(samples: Samples, effects: Effects) -> Samples:
-    """``samples`` with the gain and vignetting of ``effects``."""
+    """``samples`` with the gain and vignetting of ``effects``, if there are any."""
     return replace(samples, log_exposure=_log_exposure(samples, effects))
 
 
-def _log_exposure(samples: Samples, effects: Effects) -> Tensor:
+def _log_exposure(samples: Samples, effects: Effects) -> Tensor | None:
+    if "gain" not in effects and "vignetting" not in effects:
+        return None
     exposure = np.ones(len(samples), np.float32)
     if "gain" in effects:
         exposure *= effects["gain"].of(samples.frame.numpy())
@@ -113,9 +113,9 @@ class Relighting:
     @property
     def varied(self) -> Varied:
         """What the light's steps may change beside light and response. Guides that cast shadows stay: by
-        these the probe has found them better than shading can."""
+        these the probe has found them better than shading can. So do those whose light bounces."""
         frames = len(self.effects["gain"].frames) if "gain" in self.effects else 0
-        if self.effects.guides_mm is None or "shadows" in self.effects:
+        if self.effects.guides_mm is None or "shadows" in self.effects or self.bounces:
             return Varied(frames, faint=self.faint)
 
         def aside(samples: Samples, step_mm: float) -> Iterator[Samples]:
@@ -126,10 +126,12 @@ class Relighting:
     def vary(self, solver: GaussNewton, found: Renewed) -> None:
         """Gains, guides and faint effects as a step has ``found`` them, and the samples of ``solver`` lit
         so."""
-        self.brighten(solver, found.log_gain)
         samples = solver.samples
+        if len(found.log_gain):
+            self.effects = _brightened(self.effects, found.log_gain)
         if found.faint.any():
             self.faint = self.faint.with_more(found.faint)
+        if len(found.log_gain) or found.faint.any():
             samples = self._exposed(samples)
         if len(found.aside_mm):
             guides_mm = np.asarray(self.effects.guides_mm) + found.aside_mm
@@ -152,13 +154,13 @@ class Relighting:
         solver.relight(self._exposed(solver.samples))
 
     def _exposed(self, samples: Samples) -> Samples:
-        """``samples`` with the effects' gain and vignetting, and what is faint; with none if all are off."""
-        if not self.faint.found:
-            dims = "gain" in self.effects or "vignetting" in self.effects
-            return exposed(samples, self.effects) if dims else replace(samples, log_exposure=None)
+        """``samples`` with the effects' gain and vignetting, and what is faint."""
         samples = exposed(samples, self.effects)
-        log_exposure = torch.from_numpy(self.faint.log_exposure(samples)).float()
-        return replace(samples, log_exposure=samples.log_exposure + log_exposure)
+        if not self.faint.found:
+            return samples
+        faint = torch.from_numpy(self.faint.log_exposure(samples)).float()
+        known = samples.log_exposure
+        return replace(samples, log_exposure=faint if known is None else known + faint)
 
     def guided(self, samples: Samples) -> Samples:
         """``samples`` lit by the guides where they were found last."""
