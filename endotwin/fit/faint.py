@@ -2,9 +2,8 @@
 
 What predicts held-out pixels hardly better is no effect (``evidence.decide``). But three percent of γ show by
 a tenth of one of 255 levels; guides a few millimetres beside the lens, or a lens that passes a little less
-light at its rim, may stay undecided with five times that, and bend γ by ten percent. So where light bounces,
-which leaves little else to tell γ, light and response are found beside what could be there, to first order a
-factor on exposure, which the twin then lacks.
+light at its rim, may stay undecided with five times that, and bend γ by ten percent. So light and response
+are found beside what could be there, to first order a factor on exposure, which the twin then lacks.
 """
 
 from __future__ import annotations

@@ -62,7 +62,9 @@ DARKEST, BRIGHTEST = 0.24, 0.9
 """Shares of the light between which the brightest tissue (98th percentile) reflects: less is asked for where
 no light bounces; more where a mesh lacks what throws light on it, until the tissue would be a furnace."""
 
-COLOR_RANGE = (1e-3, 2.0)
+COLOR_RANGE = (1e-3, 100.0)
+"""Of base colour before light and albedo share their scale: so far from where a fit may go that nothing stops
+at the clamp, beyond which no step finds a lower cost."""
 
 CG_TOLERANCE = 1e-3
 CG_STEPS = 25

@@ -64,7 +64,7 @@ SETTLING = 4
 """Steps of the materials under a light that was found beside a bounce."""
 
 LEAVING = 2
-"""Steps in which light and materials learn to do without what is faint."""
+"""Steps in which light learns to do without what is faint, before the materials do."""
 
 CONVERGED = 2e-4
 """A step that changes the cost by a smaller share than this is the last."""
@@ -175,6 +175,7 @@ class LightStage:
                 break
             self._state, gain = self._stepped(self._state, joint=False)
             number = self._next(number, STEPS, gain, COAT_STEP)
+        self._without_faint(self._undetermined)
         return None
 
     def _in_one_step(self) -> Toned | None:
@@ -199,8 +200,7 @@ class LightStage:
             number = self._next(number, BOUNCE_STEPS, gain, BOUNCE_COAT_STEP)
         if best is not None:
             self._take_best(self._by_what_varies(best))
-        if self._relighting.faint.found:
-            self._without_faint()
+        self._without_faint((*self._undetermined, *BOUNCE_HELD, "albedo scale"))
         return None
 
     def _by_what_varies(self, best: Best) -> Best:
@@ -221,15 +221,17 @@ class LightStage:
             best = newer
         return best
 
-    def _without_faint(self) -> None:
-        """The light that predicts best without what is too faint to be an effect; γ, and how light bounces,
-        stay as they were found beside it."""
+    def _without_faint(self, held: tuple[str, ...]) -> None:
+        """The light that predicts best without what is too faint to be an effect, if there is any; γ and what
+        is ``held`` stay as they were found beside it."""
+        if not self._relighting.faint.found:
+            return
         self._relighting.expose(self._solver, self._relighting.effects)
-        held = (*self._undetermined, *BOUNCE_HELD, "albedo scale", "gamma")
         for _ in range(LEAVING):
-            if self._late:
-                break
-            self._renew(self._state.shared, held, self._noise)
+            if self._pace.light_is_over():
+                return
+            self._renew(self._state.shared, (*held, "gamma"), self._noise)
+        if not self._late:
             self._state, _ = self._stepped(self._state, joint=False)
 
     def _renew(self, shared: Globals, held: tuple[str, ...], noise: float) -> None:

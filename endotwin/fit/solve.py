@@ -212,14 +212,14 @@ def _find_light(
 
         late, telling = pace.light_is_over, shown[pixels.telling]
         decided = decide(telling, twin, caster, glints, states, late, near_mm or AT_LENS)
-        faint = NOTHING
-        if decided.effects.bounce:
-            faint = Faint.beside(decided.effects, states, shown[pixels.light], surface)
-        relighting = Relighting(surface, caster, decided.effects, samples.views, faint)
         if decided.light is not None:
             start = start_at(shown[pixels.start], *mesh, decided.light, decided.gamma)
         elif toned is not None:
             start = closed_form(shown[pixels.start], *mesh)
+        faint = NOTHING
+        if not start.undetermined:
+            faint = Faint.beside(decided.effects, states, shown[pixels.light], surface)
+        relighting = Relighting(surface, caster, decided.effects, samples.views, faint)
         samples = lit(samples, surface, caster, relighting.effects)
     with pace.stopwatch.stage("light"):
         wanted = {name: states.get(name, "auto") for name in ("coat", "tone")}

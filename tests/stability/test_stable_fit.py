@@ -53,7 +53,8 @@ def test_twenty_seeds_agree_within_three_tenths_of_a_decibel_and_one_percent_of_
 
 @pytest.mark.parametrize("gamma, n, q", [(1.5, 1.0, 1.0), (0.7, 1.0, 1.0), (1.0, 1.6, 0.8), (1.2, 0.5, 1.2)])
 def test_refinement_from_a_bad_start_comes_to_the_same_light(tube, monkeypatch, gamma, n, q):
-    """From γ off by up to half, n by 60 % or q by 20 %, six steps lead to within 1.5 % of γ and 2 dB."""
+    """From γ off by up to half, n by 60 % or q by 20 %, six steps lead to within 1 % of γ and 2 dB: nothing
+    that a start leaves behind passes for what is faint."""
     good = endotwin.fit_twin(tube)
     closed_form = solve.closed_form
 
@@ -66,7 +67,23 @@ def test_refinement_from_a_bad_start_comes_to_the_same_light(tube, monkeypatch, 
     twin = endotwin.fit_twin(tube)
     scores = [endotwin.evaluate(one).psnr_covered for one in (twin, good)]
     assert scores[0] > scores[1] - 2
-    assert twin.response.gamma == pytest.approx(good.response.gamma, rel=0.015)
+    assert twin.response.gamma == pytest.approx(good.response.gamma, rel=0.01)
+
+
+def test_bright_tissue_under_little_light_is_as_good_a_start(tube, monkeypatch):
+    """Albedo and light share one scale: a start with eight times the one and an eighth of the other."""
+    good = endotwin.fit_twin(tube)
+    closed_form = solve.closed_form
+
+    def bright(*arguments):
+        start = closed_form(*arguments)
+        light = replace(start.light, L0=start.light.L0 / 8)
+        return replace(start, light=light, base_color=8 * start.base_color)
+
+    monkeypatch.setattr(solve, "closed_form", bright)
+    twin = endotwin.fit_twin(tube)
+    assert twin.response.gamma == pytest.approx(good.response.gamma, rel=0.003)
+    assert endotwin.evaluate(twin).psnr_covered > endotwin.evaluate(good).psnr_covered - 0.3
 
 
 def test_single_precision_gives_the_light_materials_and_scores_of_double(tube):
