@@ -16,10 +16,13 @@ Guides = tuple[tuple[float, float, float], ...]
 """Positions in the camera frame, mm."""
 
 RING = 0.12
-"""Radius of the ring on which guides are first sought, as a share of the median viewing distance: a tip
-that sees the wall at 20 mm has its guides within some 4 mm."""
+"""By what guides' places are measured, as a share of the median viewing distance: 2.4 mm at a tip that sees
+the wall from 20 mm."""
 
-RING_RADII = (0.5, 1.0)
+RING_RADII = (0.5, 1.0, 2.5)
+"""Of it, the rings about the lens on which guides are first sought: the outermost is the rim of such a tip.
+From those within the search does not get out to guides that stand there."""
+
 RING_POINTS = 8
 MOST_GUIDES = 3
 SEARCH_PIXELS = 8_000
@@ -101,7 +104,7 @@ class Search:
         self._candidates = np.concatenate([ring_mm(probe, share) for share in RING_RADII])
         seen = [probe.visible(guide) for guide in self._candidates]
         self._at_risk = np.flatnonzero(~np.logical_and.reduce(seen))
-        self._radius_mm = float(np.abs(self._candidates).max())
+        self._radius_mm = float(np.abs(ring_mm(probe)).max())
         self.best = cache(self._best)
         self._seen = lru_cache(SEEN_GUIDES)(lambda guide: probe.visible(np.float32(guide), self._at_risk))
 

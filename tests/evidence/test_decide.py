@@ -8,11 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from independent.scene import Scene
+from independent.write import make
 
 from endotwin.config import STANDARD
 from endotwin.effects.vignetting import Vignetting
 from endotwin.evidence.decide import decide
 from endotwin.evidence.glints import Glints
+from endotwin.evidence.guide_search import found_guides
 from endotwin.evidence.probe import Hypothesis, Probe
 from endotwin.pipeline import fuse_twin
 from endotwin.pixels.pace import Pace
@@ -136,6 +139,15 @@ def test_an_effect_that_is_forced_off_stays_off(example):
 def test_interreflection_turns_itself_on_in_a_tube_that_has_it():
     decided = decide(*reordered(scene(DATA / "colon_gi", 0.5)), {})
     assert states(decided) == {**dict.fromkeys(LIGHT, "off"), "interreflection": "on"}
+
+
+def test_guides_that_stand_far_out_for_how_near_the_wall_is_are_found(tmp_path):
+    """4.7 mm beside the lens, where the wall is seen from 15 mm."""
+    made = make(replace(Scene.draw(54, ["offset"]), frames=8), tmp_path / "scene")
+    twin, caster, samples, glints = scene(tmp_path / "scene", 0.5)
+    found = found_guides(Probe(samples, twin, caster), Hypothesis(), glints(), forced=False)
+    for true_mm in made["guides_mm"]:
+        assert np.linalg.norm(np.subtract(found, true_mm), axis=1).min() < 0.6
 
 
 @pytest.fixture(scope="module")
