@@ -170,7 +170,7 @@ class Relighting:
 
     def without_bounce(self, solver: GaussNewton, state: State) -> State:
         """From here on no light bounces: the photos show none. ``state`` as if there had never been any."""
-        self._bouncer, self.faint = None, NOTHING
+        self._bouncer = None
         self.effects = self.effects.including(replace(self.effects["interreflection"], strength=0.0))
         solver.relight(replace(solver.samples, bounce=None))
         return replace(state, shared=state.shared.without_scale())
