@@ -14,6 +14,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from endotwin.effects import Effects
+from endotwin.effects.noise import LEVEL
 from endotwin.effects.vignetting import squared_radius
 from endotwin.pixels.length_unit import unit_mm
 from endotwin.pixels.samples import Samples
@@ -68,6 +69,11 @@ class Faint:
     def possible(self) -> bool:
         """Whether an endoscope may have it; else the model lacks something that is not faint."""
         return bool((np.abs(self.coefficients) <= 1).all())
+
+    def shows(self, samples: Samples, gamma: float) -> bool:
+        """Whether it changes middle grey by one of 255 levels, root mean square over samples: what changes it
+        by less is what the model errs by elsewhere."""
+        return gamma * float(self.log_exposure(samples).std()) / 2 >= LEVEL
 
     def with_more(self, coefficients: np.ndarray) -> Faint:
         """The same with ``coefficients`` [K] added."""

@@ -222,15 +222,18 @@ class LightStage:
         return best
 
     def _without_faint(self, held: tuple[str, ...]) -> None:
-        """The light that predicts best without what is too faint to be an effect, if there is any; γ and what
-        is ``held`` stay as they were found beside it."""
-        if not self._relighting.faint.found:
+        """The light that predicts best without what is too faint to be an effect, if there is any. What is
+        ``held`` stays as it was found beside it, and so does γ, if the photos show it at all."""
+        solver, relighting = self._solver, self._relighting
+        if not relighting.faint.found:
             return
-        self._relighting.expose(self._solver, self._relighting.effects)
+        if relighting.faint.shows(solver.samples, self._state.shared.gamma):
+            held = (*held, "gamma")
+        relighting.expose(solver, relighting.effects)
         for _ in range(LEAVING):
             if self._pace.light_is_over():
                 return
-            self._renew(self._state.shared, (*held, "gamma"), self._noise)
+            self._renew(self._state.shared, held, self._noise)
         if not self._late:
             self._state, _ = self._stepped(self._state, joint=False)
 
