@@ -87,6 +87,19 @@ def test_vignetting_is_a_shape_and_what_is_on_or_forced_off_is_none(plain):
         assert not none.log_exposure(samples).any()
 
 
+@pytest.mark.parametrize("gamma", [0.3, 1 / 2.2])
+def test_what_changes_middle_grey_by_less_than_a_level_does_not_show(plain, gamma):
+    twin, samples = plain
+    faint = Faint.beside(NONE, {"offset": "off"}, samples, twin.surface)
+    one = 1 / float(faint.with_more(np.ones(1)).log_exposure(samples).std())
+    grey = 0.5 ** (1 / gamma)
+    for levels in (0.9, 1.1):
+        brighter = grey * np.exp(levels * np.log1p(2 / 255) / gamma)
+        assert brighter**gamma - 0.5 == pytest.approx(levels / 255, rel=0.01)
+        found = faint.with_more(np.array([one * levels * np.log1p(2 / 255) / gamma]))
+        assert found.shows(samples, gamma) == (levels > 1)
+
+
 @pytest.mark.parametrize("scale", [1e-30, 1e-3, 1e3, 1e30])
 def test_points_at_the_lens_and_far_away_get_a_finite_factor(plain, scale):
     twin, samples = plain

@@ -200,7 +200,7 @@ class LightStage:
             number = self._next(number, BOUNCE_STEPS, gain, BOUNCE_COAT_STEP)
         if best is not None:
             self._take_best(self._by_what_varies(best))
-        self._without_faint((*self._undetermined, *BOUNCE_HELD, "albedo scale"))
+        self._without_faint((*self._undetermined, *BOUNCE_HELD, "albedo scale", "gamma"))
         return None
 
     def _by_what_varies(self, best: Best) -> Best:
@@ -222,8 +222,8 @@ class LightStage:
         return best
 
     def _without_faint(self, held: tuple[str, ...]) -> None:
-        """The light that predicts best without what is too faint to be an effect, if there is any. What is
-        ``held`` stays as it was found beside it, and so does γ, if the photos show it at all."""
+        """The light that predicts best without what is too faint to be an effect, if there is any; what is
+        ``held`` stays as it was found beside it, and so does γ, if the photos show it."""
         solver, relighting = self._solver, self._relighting
         if not relighting.faint.found:
             return

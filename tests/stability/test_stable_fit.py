@@ -82,7 +82,7 @@ def test_bright_tissue_under_little_light_is_as_good_a_start(tube, monkeypatch):
 
     monkeypatch.setattr(solve, "closed_form", bright)
     twin = endotwin.fit_twin(tube)
-    assert twin.response.gamma == pytest.approx(good.response.gamma, rel=0.003)
+    assert twin.response.gamma == pytest.approx(good.response.gamma, rel=0.01)
     assert endotwin.evaluate(twin).psnr_covered > endotwin.evaluate(good).psnr_covered - 0.3
 
 
