@@ -43,11 +43,16 @@ ASIDE, POLISH_ASIDE = 0.1, 0.05
 shadows that jump from pixel to pixel hide it."""
 
 
-def ring_mm(probe: Probe, share: float = 1.0) -> np.ndarray:
-    """Positions about the lens, float32 [RING_POINTS, 3]."""
-    radius_mm = share * RING * float(np.exp(np.median(probe.samples.log_distance.numpy())))
+def radius_mm(probe: Probe) -> float:
+    """RING of the median viewing distance."""
+    return RING * float(np.exp(np.median(probe.samples.log_distance.numpy())))
+
+
+def ring_mm(probe: Probe, share: float) -> np.ndarray:
+    """Positions about the lens at a ``share`` of the radius, float32 [RING_POINTS, 3]."""
     angle = 2 * np.pi * np.arange(RING_POINTS) / RING_POINTS
-    return (radius_mm * np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)).astype(np.float32)
+    around = np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)
+    return (share * radius_mm(probe) * around).astype(np.float32)
 
 
 def found_guides(
@@ -104,7 +109,7 @@ class Search:
         self._candidates = np.concatenate([ring_mm(probe, share) for share in RING_RADII])
         seen = [probe.visible(guide) for guide in self._candidates]
         self._at_risk = np.flatnonzero(~np.logical_and.reduce(seen))
-        self._radius_mm = float(np.abs(ring_mm(probe)).max())
+        self._radius_mm = radius_mm(probe)
         self.best = cache(self._best)
         self._seen = lru_cache(SEEN_GUIDES)(lambda guide: probe.visible(np.float32(guide), self._at_risk))
 
