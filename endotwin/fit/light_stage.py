@@ -215,10 +215,9 @@ class LightStage:
             self._renew(self._state.shared, held, best.noise)
             for _ in range(SETTLING):
                 self._state, _ = self._stepped(self._state, joint=False)
-            newer = self._better(best, self._state)
-            if newer is best:
+            before, best = best, self._better(best, self._state)
+            if before.cost - best.cost < CONVERGED * before.cost:
                 break
-            best = newer
         return best
 
     def _without_faint(self, held: tuple[str, ...]) -> None:

@@ -45,7 +45,7 @@ logger = logging.getLogger("endotwin")
 
 Price = Callable[[Twin, Caster, Views], Twin]
 
-LIGHT_PIXELS = 400_000
+LIGHT_PIXELS = 150_000
 LIGHT_SHARE = 0.25
 """Of fewer pixels than it takes to find LIGHT_PIXELS, this share."""
 
@@ -142,7 +142,8 @@ class _Pixels:
     Attributes:
         smooth: bool [N], off the creases of the surface. telling: rows int64 of those that tell the light:
             smooth, and not clipped. start: of these, that the fit starts from. light: of these, by which the
-            light is found. white: smooth ones that are clipped, to go with those.
+            light is found, all that some vertices have: pixels of a place tell by how they differ. white:
+            smooth ones that are clipped, to go with those.
     """
 
     samples: Samples
@@ -168,7 +169,10 @@ class _Pixels:
             return rows[drawn(len(rows), count, np.random.default_rng(seed))]
 
         start = some(telling, pace.start_pixels)
-        light = some(start, min(LIGHT_PIXELS, int(LIGHT_SHARE * pace.start_pixels)))
+        vertex = samples[torch.from_numpy(telling)].nearest(twin.surface.triangles)
+        order = np.random.default_rng(seed).permutation(len(twin.surface.vertices_mm))[vertex]
+        count = min(len(telling), LIGHT_PIXELS, int(LIGHT_SHARE * pace.start_pixels))
+        light = telling[order <= np.partition(order, count - 1)[count - 1]]
         white = np.flatnonzero(smooth & clipped)
         white = some(white, len(white) * len(light) // len(telling))
         return cls(samples, *map(torch.from_numpy, (smooth, telling, start, light, white)))
