@@ -228,10 +228,10 @@ class Within:
             untoned = torch.log(torch.from_numpy(tone.undone(shown)) / predicted)
             relative = [untoned, *(x / predicted for x in passing), bend(predicted) / steep]
             for number, ratio in enumerate(RATIOS):
-                variance = (noise / steep) ** 2 @ ratio**2 + RATIO_ERROR**2
+                variance = ((noise / steep) ** 2 @ ratio**2).numpy()
                 columns = tuple((x @ ratio).numpy() for x in relative)
-                place, _, *means, total = self._means(rows, columns, 1 / variance.numpy())
-                found.append((place + number * self.count, means[0], np.stack(means[1:], axis=1), total))
+                place, _, *means, weight = self._means(rows, columns, variance, RATIO_ERROR)
+                found.append((place + number * self.count, means[0], np.stack(means[1:], axis=1), weight))
             return Hues(*map(np.concatenate, zip(*found, strict=True)))
 
         return without
@@ -344,9 +344,8 @@ class Within:
         by_faint = shared.gamma * slopes[:, LEVEL] * shapes
         by_raw = roughness_slope(material[rows, 3])[:, None]
         by_roughness = (model.by_roughness[bright] * by_raw * tells).mean(dim=1).numpy() / predicted
-        weight = 1 / ((noise / predicted) ** 2 + MODEL_ERROR**2)
         columns = (residual, by_roughness, by_coat, *slopes.T, *by_guides, *by_faint)
-        return self._gathered(rows, columns, weight, slopes.shape[1])
+        return self._gathered(rows, columns, (noise / predicted) ** 2, MODEL_ERROR, slopes.shape[1])
 
     def _ratios(
         self, material: Tensor, shared: Globals, chosen: Tensor, noise: float, varied: int
@@ -366,8 +365,8 @@ class Within:
         for number, ratio in enumerate(RATIOS, start=1):
             by_shared = (ratio @ slopes).T.numpy()
             columns = ((residual @ ratio).numpy(), (by_roughness @ ratio).numpy(), np.zeros(len(rows)))
-            variance = (noise / predicted) ** 2 @ ratio**2 + RATIO_ERROR**2
-            each = self._gathered(rows, (*columns, *by_shared), 1 / variance.numpy(), len(by_shared))
+            variance = ((noise / predicted) ** 2 @ ratio**2).numpy()
+            each = self._gathered(rows, (*columns, *by_shared), variance, RATIO_ERROR, len(by_shared))
             first = np.full_like(each.frame, self.samples.views.frames[0])
             same = np.zeros((len(first), varied))
             vertex = each.vertex + number * self.count
@@ -375,22 +374,28 @@ class Within:
         return found[0].beside(found[1])
 
     def _gathered(
-        self, rows: Tensor, columns: tuple[np.ndarray, ...], weight: np.ndarray, count: int
+        self, rows: Tensor, columns: tuple[np.ndarray, ...], variance: np.ndarray, error: float, count: int
     ) -> Sightings:
         """Sightings of samples ``rows``: means of residual, slopes by roughness and coat, by ``count`` shared
         parameters and by what is varied, each [R]."""
-        vertex, frame, *means, total = self._means(rows, columns, weight)
+        vertex, frame, *means, weight = self._means(rows, columns, variance, error)
         slopes, by_varied = np.split(np.stack(means[3:], axis=1), [count], axis=1)
-        return Sightings(vertex, frame, means[0], slopes, *means[1:3], by_varied, total)
+        return Sightings(vertex, frame, means[0], slopes, *means[1:3], by_varied, weight)
 
-    def _means(self, rows: Tensor, columns: tuple[np.ndarray, ...], weight: np.ndarray) -> list[np.ndarray]:
-        """Vertex, frame, means of the ``columns`` and sum of the weights of what the samples ``rows`` [R]
-        show of a vertex in one photo, each [S]."""
+    def _means(
+        self, rows: Tensor, columns: tuple[np.ndarray, ...], variance: np.ndarray, error: float
+    ) -> list[np.ndarray]:
+        """Vertex, frame, means of the ``columns`` and their inverse variance of what the samples ``rows`` [R]
+        show of a vertex in one photo, each [S].
+
+        Noise of ``variance`` [R] is each pixel's own, the model's ``error`` that of all.
+        """
         place = self.vertex[rows.numpy()].astype(np.int64) << 32 | self.samples.frame[rows].numpy()
         place, which = np.unique(place, return_inverse=True)
-        total = np.bincount(which, weight, len(place))
-        means = [np.bincount(which, weight * column, len(place)) / total for column in columns]
-        return [place >> 32, (place & 0xFFFFFFFF).astype(np.int32), *means, total]
+        total = np.bincount(which, 1 / variance, len(place))
+        means = [np.bincount(which, column / variance, len(place)) / total for column in columns]
+        weight = 1 / (1 / total + error**2)
+        return [place >> 32, (place & 0xFFFFFFFF).astype(np.int32), *means, weight]
 
     def _by_guides(
         self,
