@@ -270,3 +270,22 @@ def test_beside_a_bounce_colours_tell_the_response_where_gains_swallow_all_that_
         start, exposure = found.shared, exposure + torch.from_numpy(found.log_gain)
     assert start.gamma == pytest.approx(true.gamma, rel=0.02)
     np.testing.assert_allclose(exposure - exposure.mean(), gain - gain.mean(), atol=0.02)
+
+
+def test_beside_a_bounce_highlights_follow_the_light():
+    """L0 is held, so that where the exponent was off, all that is white is too bright or too dark."""
+    generator = np.random.default_rng(5)
+    true = replace(TRUE, vector=torch.cat([TRUE.vector, torch.zeros(1, dtype=torch.float64)]))
+    within, material = photographed()
+    count, none = len(within.samples), torch.zeros(len(within.samples))
+    log = np.log(0.1) - 2 * within.samples.log_distance[:, None] + torch.zeros(count, 3)
+    bounce = Bounce(log.float(), none, none, torch.ones(count, 3), torch.zeros(count, 3), none)
+    views = Views(None, np.ones((1, 1), bool), np.arange(SIGHTINGS), np.tile(np.eye(4), (SIGHTINGS, 1, 1)))
+    samples = replace(within.samples, bounce=bounce, views=views)
+    shown = predict(samples, material, true).numpy() + generator.normal(0, NOISE, (count, 3))
+    samples = replace(samples, color=torch.from_numpy(np.uint8(np.clip(shown, 0, 1) * 255 + 0.5)))
+    shared = Globals.of(Light(120.0, 2.5, 2.2), Response(0.42), f0=0.07, bounce=True)
+    for _ in range(8):
+        found = replace(within, samples=samples).renewed(material, shared, ("q", "albedo scale"), NOISE)
+        shared = found.shared
+    assert told(shared) == pytest.approx(told(true), rel=0.02)

@@ -22,6 +22,7 @@ from torch import Tensor
 
 from endotwin.fit.frame_gains import FramePattern
 from endotwin.fit.hashgrid import HashOperator
+from endotwin.fit.mixing import Mixing
 from endotwin.fit.model import GLOBALS, Globals, at_pixels, predict
 from endotwin.fit.normal_equations import CHANNELS, MeshPattern, NormalEquations, assemble, robust_cost
 from endotwin.light.shading import F0_DIELECTRIC
@@ -491,6 +492,16 @@ def halfway(state: State, other: State) -> State:
     vector = (state.shared.vector + other.shared.vector) / 2
     shared = replace(other.shared, vector=vector)
     return replace(other, table=(state.table + other.table) / 2, shared=shared)
+
+
+def mixed(mixing: Mixing, state: State, moved: State) -> State:
+    """``moved``, to which a step has led from ``state``, as those before it say that it should go on."""
+    point, image = (
+        np.r_[each.table.flatten().double().numpy(), each.shared.log_scale] for each in (state, moved)
+    )
+    found = mixing.mixed(point, image)
+    table = torch.from_numpy(found[:-1]).float().reshape(moved.table.shape)
+    return rescaled(replace(moved, table=table), float(found[-1]))
 
 
 def rescaled(state: State, log_scale: float) -> State:

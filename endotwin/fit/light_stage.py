@@ -23,12 +23,14 @@ from endotwin.fit.gauss_newton import (
     State,
     as_bouncing,
     halfway,
+    mixed,
     roughness_to_raw,
     too_dark,
     without_furnace,
 )
 from endotwin.fit.hashgrid import HashGrid, HashOperator
 from endotwin.fit.lighting import Relighting
+from endotwin.fit.mixing import Mixing
 from endotwin.fit.model import Globals, at_pixels
 from endotwin.fit.within import Renewed, Within
 from endotwin.light.shading import F0_DIELECTRIC, ROUGHNESS_TISSUE
@@ -60,8 +62,8 @@ off a mesh errs by would bend it, and γ with it. L0 is told by the albedo's sca
 WORSE, HALVINGS = 1.25, 2
 """A step under whose light the photos cost so many times what they did is too long, and halved so often."""
 
-SETTLING = 4
-"""Steps of the materials under a light that was found beside a bounce."""
+SETTLING = 8
+"""Steps at most of the materials under a light that was found beside a bounce."""
 
 LEAVING = 2
 """Steps in which light learns to do without what is faint, before the materials do."""
@@ -209,16 +211,29 @@ class LightStage:
         does to colours bends what varies."""
         held = (*self._undetermined, *BOUNCE_HELD, "albedo scale")
         self._take_best(best)
+        noise = self._noise
+        best = replace(best, cost=self._solver.cost(self._state, noise), noise=noise)
         for _ in range(STEPS):
             if self._pace.light_is_over():
                 break
-            self._renew(self._state.shared, held, best.noise)
-            for _ in range(SETTLING):
-                self._state, _ = self._stepped(self._state, joint=False)
+            self._renew(self._state.shared, held, noise)
+            self._settle()
             before, best = best, self._better(best, self._state)
             if before.cost - best.cost < CONVERGED * before.cost:
                 break
         return best
+
+    def _settle(self) -> None:
+        """Materials, beside a bounce until they and what they throw on each other agree."""
+        mixing = Mixing()
+        for _ in range(SETTLING if self._relighting.bounces else 1):
+            self._state, gain = self._stepped(self._state, joint=False, mixing=mixing)
+            if self._converged(gain):
+                break
+
+    def _converged(self, gain: float) -> bool:
+        """Whether a step by which the cost fell by ``gain`` changed hardly anything."""
+        return abs(gain) < CONVERGED * self._solver.cost(self._state, self._noise)
 
     def _without_faint(self, held: tuple[str, ...]) -> None:
         """The light that predicts best without what is too faint to be an effect, if there is any; what is
@@ -234,7 +249,7 @@ class LightStage:
                 return
             self._renew(self._state.shared, held, self._noise)
         if not self._late:
-            self._state, _ = self._stepped(self._state, joint=False)
+            self._settle()
 
     def _renew(self, shared: Globals, held: tuple[str, ...], noise: float) -> None:
         """Light and response, from ``shared``, and what may vary with them, by what varies within vertices.
@@ -277,7 +292,7 @@ class LightStage:
         """The number of the step that follows: where this one changed the cost by hardly anything (``gain``),
         that of the coat, or none."""
         self._pace.report("find the light", number + 1, steps)
-        if abs(gain) >= CONVERGED * self._solver.cost(self._state, self._noise):
+        if not self._converged(gain):
             return number + 1
         return steps if len(self._decisions) == len(self._wanted) else max(number + 1, coat_step)
 
@@ -322,14 +337,16 @@ class LightStage:
             return best
         return Best(state, self._relighting.effects, self._relighting.faint, cost, noise)
 
-    def _stepped(self, state: State, joint: bool) -> tuple[State, float]:
+    def _stepped(self, state: State, joint: bool, mixing: Mixing | None = None) -> tuple[State, float]:
         """A step, of the materials alone where a ``joint`` one finds nothing lower, with the samples relit by
         what it has found; and by how much the cost fell (below 0: it rose).
 
-        A step knows what it does to bounced light to first order. Where that was too far, it goes half the
-        way.
+        A joint step knows what it does to bounced light to first order. Where that was too far, it goes half
+        the way. One of the materials that is ``mixing`` with those before it takes bounced light as it is.
         """
         solver, relighting = self._solver, self._relighting
+        if mixing is not None and relighting.bounces:
+            solver.relight(solver.samples.under_still_bounce())
         found = solver.step(state, joint, gains=joint and "gain" in relighting.effects)
         if joint and not found.fell:
             found = solver.step(state, joint=False)
@@ -340,6 +357,8 @@ class LightStage:
             return moved, found.fell
         if not joint:
             moved = as_bouncing(moved, state)
+        if mixing is not None:
+            moved = mixed(mixing, state, moved)
         noise = solver.noise(state)
         before = solver.cost(state, noise)
         for halving in range(HALVINGS + 1):

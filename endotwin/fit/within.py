@@ -161,8 +161,8 @@ class Within:
     def renewed(
         self, material: Tensor, shared: Globals, held: tuple[str, ...], noise: float, varied: Varied = STILL
     ) -> Renewed:
-        """A Gauss–Newton step: light, response and what is ``varied`` by what is off the highlights, then,
-        where no light bounces, f0 and the coat by all.
+        """A Gauss–Newton step: light, response and what is ``varied`` by what is off the highlights, then f0
+        and the coat by all.
 
         How diffuse light falls off towards grazing says most of γ, and the lobe that tissue really has is
         nobody's: off the highlights its shape, which Burley's roughness sets, is found beside them and left.
@@ -174,7 +174,7 @@ class Within:
         diffuse = self.samples.sin2 > DIFFUSE_SIN2
         level = "L0" if shared.bounces else "level"
         found = self._step(material, shared, (*held, level, "f0"), diffuse, noise, varied)
-        if not shared.specular or shared.bounces:
+        if not shared.specular:
             return found
         shone = self.shone(material, found.shared, noise)
         return replace(found, shared=shone.shared, roughness=shone.roughness)
