@@ -62,7 +62,7 @@ off a mesh errs by would bend it, and γ with it. L0 is told by the albedo's sca
 WORSE, HALVINGS = 1.25, 2
 """A step under whose light the photos cost so many times what they did is too long, and halved so often."""
 
-SETTLING = 8
+SETTLING = 4
 """Steps at most of the materials under a light that was found beside a bounce."""
 
 LEAVING = 2

@@ -49,6 +49,10 @@ LIGHT_PIXELS = 150_000
 LIGHT_SHARE = 0.25
 """Of fewer pixels than it takes to find LIGHT_PIXELS, this share."""
 
+PIXELS_A_VERTEX = 4
+"""Of those: with one nothing varies within a vertex, and with all there are few vertices, between which
+materials are a guess."""
+
 DETAIL_GROWTH = 1.6
 DETAIL_COARSEST_MM = 2.56
 """Coarsest cell that detail may correct: the light's pixels leave out the creases."""
@@ -142,7 +146,7 @@ class _Pixels:
     Attributes:
         smooth: bool [N], off the creases of the surface. telling: rows int64 of those that tell the light:
             smooth, and not clipped. start: of these, that the fit starts from. light: of these, by which the
-            light is found, all that some vertices have: pixels of a place tell by how they differ. white:
+            light is found, some of each of some vertices: pixels of a place tell by how they differ. white:
             smooth ones that are clipped, to go with those.
     """
 
@@ -169,10 +173,12 @@ class _Pixels:
             return rows[drawn(len(rows), count, np.random.default_rng(seed))]
 
         start = some(telling, pace.start_pixels)
-        vertex = samples[torch.from_numpy(telling)].nearest(twin.surface.triangles)
+        seen = np.unique(samples[torch.from_numpy(telling)].nearest(twin.surface.triangles))
+        light = some(telling, PIXELS_A_VERTEX * len(seen))
+        vertex = samples[torch.from_numpy(light)].nearest(twin.surface.triangles)
         order = np.random.default_rng(seed).permutation(len(twin.surface.vertices_mm))[vertex]
-        count = min(len(telling), LIGHT_PIXELS, int(LIGHT_SHARE * pace.start_pixels))
-        light = telling[order <= np.partition(order, count - 1)[count - 1]]
+        count = min(len(light), LIGHT_PIXELS, int(LIGHT_SHARE * pace.start_pixels))
+        light = light[order <= np.partition(order, count - 1)[count - 1]]
         white = np.flatnonzero(smooth & clipped)
         white = some(white, len(white) * len(light) // len(telling))
         return cls(samples, *map(torch.from_numpy, (smooth, telling, start, light, white)))
