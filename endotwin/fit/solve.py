@@ -50,7 +50,7 @@ LIGHT_SHARE = 0.25
 """Of fewer pixels than it takes to find LIGHT_PIXELS, this share."""
 
 PIXELS_A_VERTEX = 4
-"""Of those: with one nothing varies within a vertex, and with all there are few vertices, between which
+"""Of those at least: with one nothing varies within a vertex. With all there are few vertices, between which
 materials are a guess."""
 
 DETAIL_GROWTH = 1.6
@@ -174,10 +174,10 @@ class _Pixels:
 
         start = some(telling, pace.start_pixels)
         seen = np.unique(samples[torch.from_numpy(telling)].nearest(twin.surface.triangles))
-        light = some(telling, PIXELS_A_VERTEX * len(seen))
+        count = min(len(telling), LIGHT_PIXELS, int(LIGHT_SHARE * pace.start_pixels))
+        light = some(telling, max(count, PIXELS_A_VERTEX * len(seen)))
         vertex = samples[torch.from_numpy(light)].nearest(twin.surface.triangles)
         order = np.random.default_rng(seed).permutation(len(twin.surface.vertices_mm))[vertex]
-        count = min(len(light), LIGHT_PIXELS, int(LIGHT_SHARE * pace.start_pixels))
         light = light[order <= np.partition(order, count - 1)[count - 1]]
         white = np.flatnonzero(smooth & clipped)
         white = some(white, len(white) * len(light) // len(telling))
