@@ -174,11 +174,12 @@ class _Pixels:
 
         start = some(telling, pace.start_pixels)
         seen = np.unique(samples[torch.from_numpy(telling)].nearest(twin.surface.triangles))
-        count = min(len(telling), LIGHT_PIXELS, int(LIGHT_SHARE * pace.start_pixels))
+        count = min(LIGHT_PIXELS, int(LIGHT_SHARE * pace.start_pixels))
         light = some(telling, max(count, PIXELS_A_VERTEX * len(seen)))
         vertex = samples[torch.from_numpy(light)].nearest(twin.surface.triangles)
         order = np.random.default_rng(seed).permutation(len(twin.surface.vertices_mm))[vertex]
-        light = light[order <= np.partition(order, count - 1)[count - 1]]
+        last = min(count, len(light)) - 1
+        light = light[order <= np.partition(order, last)[last]]
         white = np.flatnonzero(smooth & clipped)
         white = some(white, len(white) * len(light) // len(telling))
         return cls(samples, *map(torch.from_numpy, (smooth, telling, start, light, white)))
