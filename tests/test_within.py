@@ -23,7 +23,9 @@ from endotwin.twin import Light, Response
 
 VERTICES, SIGHTINGS = 600, 40
 TRUE = Globals.of(Light(120.0, 1.7, 2.2), Response(0.42), f0=0.035)
+BOUNCING = Globals.of(Light(120.0, 1.7, 2.2), Response(0.42), f0=0.035, bounce=True)
 BRIGHT = Globals.of(Light(360.0, 1.7, 2.2), Response(0.42), f0=0.035)
+VIEWS = Views(None, np.ones((1, 1), bool), np.arange(SIGHTINGS), np.tile(np.eye(4), (SIGHTINGS, 1, 1)))
 ROUGHNESS = 0.45
 NOISE = 1 / 255
 
@@ -51,9 +53,16 @@ def photographed(
         frame=torch.from_numpy(np.tile(np.arange(SIGHTINGS, dtype=np.int32), VERTICES)),
         pixel=torch.zeros(count, dtype=torch.int32),
     )
-    shown = predict(samples, material, true).numpy() + generator.normal(0, NOISE, (count, 3))
-    color = torch.from_numpy(np.uint8(np.clip(shown, 0, 1) * 255 + 0.5))
-    return Within(replace(samples, color=color), vertex, VERTICES, 1.0), material
+    return Within(recorded(samples, material, true, generator), vertex, VERTICES, 1.0), material
+
+
+def recorded(
+    samples: Samples, material: torch.Tensor, true: Globals, generator: np.random.Generator
+) -> Samples:
+    """``samples`` with 8-bit photos of what they show, with noise."""
+    shown = predict(samples, material, true).numpy()
+    shown = shown + generator.normal(0, NOISE, shown.shape)
+    return replace(samples, color=torch.from_numpy(np.uint8(np.clip(shown, 0, 1) * 255 + 0.5)))
 
 
 def told(shared: Globals) -> list[float]:
@@ -246,7 +255,6 @@ def test_under_a_coat_that_shines_a_clipped_photo_says_at_least():
 def test_beside_a_bounce_colours_tell_the_response_where_gains_swallow_all_that_is_grey():
     """All of a frame is lit alike, so that its gain passes for its light; only how red that is remains."""
     generator = np.random.default_rng(4)
-    true = replace(TRUE, vector=torch.cat([TRUE.vector, torch.zeros(1, dtype=torch.float64)]))
     within, material = photographed()
     frame, count = within.samples.frame.long(), len(within.samples)
     material[:, :3] = material[:, :3].clamp_max(0.5)
@@ -256,36 +264,30 @@ def test_beside_a_bounce_colours_tell_the_response_where_gains_swallow_all_that_
     bounce = Bounce(log, none, none, torch.ones(count, 3), torch.zeros(count, 3), none)
     gain = torch.from_numpy(generator.normal(0, 0.2, SIGHTINGS))
     even = {"cos": 0.5 + none, "sin2": 0.75 + none, "log_cos_axis": -0.2 + none}
-    views = Views(None, np.ones((1, 1), bool), np.arange(SIGHTINGS), np.tile(np.eye(4), (SIGHTINGS, 1, 1)))
-    samples = replace(within.samples, **even, log_distance=np.log(20.0) + none, bounce=bounce, views=views)
-    shown = predict(replace(samples, log_exposure=gain[frame]), material, true).numpy()
-    shown = shown + generator.normal(0, NOISE, shown.shape)
-    samples = replace(samples, color=torch.from_numpy(np.uint8(np.clip(shown, 0, 1) * 255 + 0.5)))
-    log_L0, n, q = true.log_light
+    samples = replace(within.samples, **even, log_distance=np.log(20.0) + none, bounce=bounce, views=VIEWS)
+    samples = recorded(replace(samples, log_exposure=gain[frame]), material, BOUNCING, generator)
+    log_L0, n, q = BOUNCING.log_light
     start = Globals.of(Light(math.exp(log_L0), n, q), Response(0.5), f0=0.035, bounce=True)
     exposure = torch.zeros(SIGHTINGS, dtype=torch.float64)
     for _ in range(8):
         lit = replace(within, samples=replace(samples, log_exposure=exposure[frame]))
         found = lit.renewed(material, start, ("n", "q", "albedo scale"), NOISE, Varied(SIGHTINGS))
         start, exposure = found.shared, exposure + torch.from_numpy(found.log_gain)
-    assert start.gamma == pytest.approx(true.gamma, rel=0.02)
+    assert start.gamma == pytest.approx(BOUNCING.gamma, rel=0.02)
     np.testing.assert_allclose(exposure - exposure.mean(), gain - gain.mean(), atol=0.02)
 
 
 def test_beside_a_bounce_highlights_follow_the_light():
     """L0 is held, so that where the exponent was off, all that is white is too bright or too dark."""
     generator = np.random.default_rng(5)
-    true = replace(TRUE, vector=torch.cat([TRUE.vector, torch.zeros(1, dtype=torch.float64)]))
     within, material = photographed()
     count, none = len(within.samples), torch.zeros(len(within.samples))
     log = np.log(0.1) - 2 * within.samples.log_distance[:, None] + torch.zeros(count, 3)
     bounce = Bounce(log.float(), none, none, torch.ones(count, 3), torch.zeros(count, 3), none)
-    views = Views(None, np.ones((1, 1), bool), np.arange(SIGHTINGS), np.tile(np.eye(4), (SIGHTINGS, 1, 1)))
-    samples = replace(within.samples, bounce=bounce, views=views)
-    shown = predict(samples, material, true).numpy() + generator.normal(0, NOISE, (count, 3))
-    samples = replace(samples, color=torch.from_numpy(np.uint8(np.clip(shown, 0, 1) * 255 + 0.5)))
+    samples = replace(within.samples, bounce=bounce, views=VIEWS)
+    samples = recorded(samples, material, BOUNCING, generator)
     shared = Globals.of(Light(120.0, 2.5, 2.2), Response(0.42), f0=0.07, bounce=True)
     for _ in range(8):
         found = replace(within, samples=samples).renewed(material, shared, ("q", "albedo scale"), NOISE)
         shared = found.shared
-    assert told(shared) == pytest.approx(told(true), rel=0.02)
+    assert told(shared) == pytest.approx(told(BOUNCING), rel=0.02)

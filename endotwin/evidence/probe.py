@@ -31,10 +31,10 @@ from endotwin.pixels.fixed_effects import (
     robust_losses,
     robust_residuals,
 )
+from endotwin.pixels.samples import Samples, whole_groups
 from endotwin.pixels.start import LIGHT_MEAN, LIGHT_SPREAD, PRIOR, dark, diffuse
 
 if TYPE_CHECKING:
-    from endotwin.pixels.samples import Samples
     from endotwin.surface.casting import Caster
     from endotwin.twin import Twin
 
@@ -176,7 +176,7 @@ class Probe(Sightings):
         surface = twin.surface
         generator = np.random.default_rng(seed)
         rows, every = np.flatnonzero(diffuse(samples)), samples.nearest(surface.triangles)
-        chosen = _whole_groups(every[rows], len(surface.vertices_mm), pixels, generator)
+        chosen = whole_groups(every[rows], len(surface.vertices_mm), pixels, generator, LEAST_PIXELS)
         self._rows = rows[chosen]
         known, vertex = np.unique(every[self._rows], return_inverse=True)
         super().__init__(samples[torch.from_numpy(self._rows)], vertex.reshape(-1), twin, caster)
@@ -338,13 +338,3 @@ def held_out(
         found = regress(target[part], design[part], categories)
         losses[~part] = robust_losses(target[~part], design[~part], found, width)
     return losses
-
-
-def _whole_groups(group: np.ndarray, count: int, wanted: int, generator: np.random.Generator) -> np.ndarray:
-    """Rows of whole groups, drawn at random until ``wanted`` rows are there; groups with few rows are left
-    out."""
-    size = np.bincount(group, minlength=count)
-    order = generator.permutation(np.flatnonzero(size >= LEAST_PIXELS))
-    taken = np.zeros(count, bool)
-    taken[order[: int(np.searchsorted(np.cumsum(size[order]), wanted)) + 1]] = True
-    return np.flatnonzero(taken[group])

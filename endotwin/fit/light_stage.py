@@ -211,12 +211,11 @@ class LightStage:
         does to colours bends what varies."""
         held = (*self._undetermined, *BOUNCE_HELD, "albedo scale")
         self._take_best(best)
-        noise = self._noise
-        best = replace(best, cost=self._solver.cost(self._state, noise), noise=noise)
+        best = self._better(None, self._state)
         for _ in range(STEPS):
             if self._pace.light_is_over():
                 break
-            self._renew(self._state.shared, held, noise)
+            self._renew(self._state.shared, held, best.noise)
             self._settle()
             before, best = best, self._better(best, self._state)
             if before.cost - best.cost < CONVERGED * before.cost:
@@ -224,9 +223,9 @@ class LightStage:
         return best
 
     def _settle(self) -> None:
-        """Materials, beside a bounce until they and what they throw on each other agree."""
+        """Materials beside a bounce, until they and what they throw on each other agree."""
         mixing = Mixing()
-        for _ in range(SETTLING if self._relighting.bounces else 1):
+        for _ in range(SETTLING):
             self._state, gain = self._stepped(self._state, joint=False, mixing=mixing)
             if self._converged(gain):
                 break
@@ -248,8 +247,12 @@ class LightStage:
             if self._pace.light_is_over():
                 return
             self._renew(self._state.shared, held, self._noise)
-        if not self._late:
+        if self._late:
+            return
+        if relighting.bounces:
             self._settle()
+        else:
+            self._state, _ = self._stepped(self._state, joint=False)
 
     def _renew(self, shared: Globals, held: tuple[str, ...], noise: float) -> None:
         """Light and response, from ``shared``, and what may vary with them, by what varies within vertices.
@@ -345,7 +348,7 @@ class LightStage:
         the way. One of the materials that is ``mixing`` with those before it takes bounced light as it is.
         """
         solver, relighting = self._solver, self._relighting
-        if mixing is not None and relighting.bounces:
+        if mixing is not None:
             solver.relight(solver.samples.under_still_bounce())
         found = solver.step(state, joint, gains=joint and "gain" in relighting.effects)
         if joint and not found.fell:

@@ -34,7 +34,7 @@ from endotwin.light.film import Film
 from endotwin.light.guides import AT_LENS
 from endotwin.pixels.length_unit import unit_mm
 from endotwin.pixels.pace import ITERATIONS, Pace
-from endotwin.pixels.samples import Samples, Views, drawn, gather
+from endotwin.pixels.samples import Samples, Views, drawn, gather, whole_groups
 from endotwin.pixels.start import ALBEDO_TOP, BRIGHT, Start, closed_form, start_at
 from endotwin.run.threads import THREADS
 from endotwin.surface import Surface
@@ -173,16 +173,21 @@ class _Pixels:
             return rows[drawn(len(rows), count, np.random.default_rng(seed))]
 
         start = some(telling, pace.start_pixels)
-        seen = np.unique(samples[torch.from_numpy(telling)].nearest(twin.surface.triangles))
+        vertex = samples[torch.from_numpy(telling)].nearest(twin.surface.triangles)
         count = min(LIGHT_PIXELS, int(LIGHT_SHARE * pace.start_pixels))
-        light = some(telling, max(count, PIXELS_A_VERTEX * len(seen)))
-        vertex = samples[torch.from_numpy(light)].nearest(twin.surface.triangles)
-        order = np.random.default_rng(seed).permutation(len(twin.surface.vertices_mm))[vertex]
-        last = min(count, len(light)) - 1
-        light = light[order <= np.partition(order, last)[last]]
+        light = telling[_of_some_vertices(vertex, count, np.random.default_rng(seed))]
         white = np.flatnonzero(smooth & clipped)
         white = some(white, len(white) * len(light) // len(telling))
         return cls(samples, *map(torch.from_numpy, (smooth, telling, start, light, white)))
+
+
+def _of_some_vertices(vertex: np.ndarray, count: int, generator: np.random.Generator) -> np.ndarray:
+    """Rows of about ``count`` pixels, of those whose vertices are ``vertex`` [N]: about PIXELS_A_VERTEX of a
+    vertex, more where those would be too few, and all if there are no more."""
+    pixels = np.bincount(vertex)
+    few = max(count, PIXELS_A_VERTEX * np.count_nonzero(pixels))
+    rows = drawn(len(vertex), few, generator)
+    return rows[whole_groups(vertex[rows], len(pixels), count, generator)]
 
 
 @dataclass(frozen=True)

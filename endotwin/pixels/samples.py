@@ -175,6 +175,22 @@ def drawn(count: int, wanted: int, generator: np.random.Generator) -> np.ndarray
     return np.flatnonzero(generator.random(count, np.float32) < wanted / count)
 
 
+def whole_groups(
+    group: np.ndarray, count: int, wanted: int, generator: np.random.Generator, least: int = 1
+) -> np.ndarray:
+    """Rows of whole groups, ascending, drawn at random until ``wanted`` rows are there, or all; groups with
+    fewer than the ``least`` rows are left out.
+
+    Args:
+        group: int [N], below ``count``.
+    """
+    size = np.bincount(group, minlength=count)
+    order = generator.permutation(np.flatnonzero(size >= least))
+    taken = np.zeros(count, bool)
+    taken[order[: int(np.searchsorted(np.cumsum(size[order]), wanted)) + 1]] = True
+    return np.flatnonzero(taken[group])
+
+
 def _joined(parts: list, **more):
     """Dataclasses of one kind whose columns, and those of their columns, are joined; None stays None."""
     columns = {}
