@@ -7,7 +7,9 @@ import numpy as np
 import pytest
 import torch
 
-from endotwin.fit.gauss_newton import (
+from endotwin.fit.gauss_newton import unusual
+from endotwin.fit.model import Globals
+from endotwin.fit.state import (
     BRIGHTEST,
     DARKEST,
     GLOBAL_RANGE,
@@ -17,10 +19,8 @@ from endotwin.fit.gauss_newton import (
     rescaled,
     room_below_furnace,
     too_dark,
-    unusual,
     without_furnace,
 )
-from endotwin.fit.model import Globals
 from endotwin.twin import Light, Response
 
 

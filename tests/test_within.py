@@ -13,8 +13,8 @@ from endotwin.effects.tone import Tone
 from endotwin.evidence.coat import judged
 from endotwin.evidence.tone import judged as judged_tone
 from endotwin.evidence.tone import steadied
-from endotwin.fit.gauss_newton import ROUGHNESS_RANGE, roughness_to_raw
 from endotwin.fit.model import Globals, predict
+from endotwin.fit.state import ROUGHNESS_RANGE, roughness_to_raw
 from endotwin.fit.within import Varied, Within
 from endotwin.light.bounced import Bounce
 from endotwin.pixels.samples import Samples, Views

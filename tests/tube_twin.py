@@ -9,9 +9,9 @@ import numpy as np
 import torch
 
 from endotwin.cameras import Camera, Pinhole
-from endotwin.fit.gauss_newton import State, roughness_to_raw
 from endotwin.fit.hashgrid import HashOperator
 from endotwin.fit.model import Globals
+from endotwin.fit.state import State, roughness_to_raw
 from endotwin.light.incidence import incidence
 from endotwin.pixels.samples import Samples, Views
 from endotwin.render import Renderer

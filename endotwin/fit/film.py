@@ -22,10 +22,10 @@ from torch.nn.functional import normalize
 from endotwin.cameras import Camera
 from endotwin.effects import Decision
 from endotwin.effects.film import Film as FilmEffect
-from endotwin.fit.gauss_newton import State
 from endotwin.fit.heal import REACH_PX, healed
 from endotwin.fit.lighting import Relighting, lit
 from endotwin.fit.model import at_pixels, radiance
+from endotwin.fit.state import State
 from endotwin.light import shading
 from endotwin.light.film import Film, film_in_view, mirrored, mirrors_in_view
 from endotwin.light.guides import lamps_mm

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 from typing import NamedTuple
 
@@ -22,9 +22,9 @@ from torch import Tensor
 
 from endotwin.fit.frame_gains import FramePattern
 from endotwin.fit.hashgrid import HashOperator
-from endotwin.fit.mixing import Mixing
 from endotwin.fit.model import GLOBALS, Globals, at_pixels, predict
 from endotwin.fit.normal_equations import CHANNELS, MeshPattern, NormalEquations, assemble, robust_cost
+from endotwin.fit.state import GLOBAL_RANGE, ROUGHNESS_RANGE, State, bounded, room_below_furnace
 from endotwin.light.shading import F0_DIELECTRIC
 from endotwin.pixels.samples import Samples, drawn
 from endotwin.pixels.start import LIGHT_MEAN, LIGHT_SPREAD, PRIOR
@@ -40,7 +40,6 @@ TEMPER = 4.0
 HUBER = 1.0
 """Residuals beyond so many noise widths count linearly: rims, highlights, what the model does not know."""
 
-ROUGHNESS_RANGE = (0.08, 1.0)
 COLOR_SPREAD = 0.5
 ROUGHNESS_LOGIT_SPREAD = 0.1 * 4 / (ROUGHNESS_RANGE[1] - ROUGHNESS_RANGE[0])
 """Standard deviation of a table entry of a COARSE_MM cell: base colour, roughness."""
@@ -49,8 +48,7 @@ COARSE_MM = 12.0
 
 GLOBAL_MEAN = (0.0, *LIGHT_MEAN, math.log(F0_DIELECTRIC), 0.0)
 GLOBAL_SPREAD = (5.0, *LIGHT_SPREAD, 0.5, 0.5)
-GLOBAL_RANGE = ((-20.0, 20.0), (0.0, 10.0), (0.0, 4.0), (0.15, 1.5), (-6.0, -0.7), (-4.0, 4.0))
-"""Prior and bounds of the shared parameters, in the order of BOUNCE_GLOBALS."""
+"""Prior of the shared parameters, in the order of BOUNCE_GLOBALS."""
 
 USUAL_SIGMAS = 3.0
 AT_EDGE = 0.01
@@ -59,13 +57,6 @@ and γ are no endoscope's."""
 
 F0 = GLOBALS.index("ln f0")
 
-DARKEST, BRIGHTEST = 0.24, 0.9
-"""Shares of the light between which the brightest tissue (98th percentile) reflects: less is asked for where
-no light bounces; more where a mesh lacks what throws light on it, until the tissue would be a furnace."""
-
-COLOR_RANGE = (1e-3, 100.0)
-"""Of base colour before light and albedo share their scale: so far from where a fit may go that nothing stops
-at the clamp, beyond which no step finds a lower cost."""
 
 CG_TOLERANCE = 1e-3
 CG_STEPS = 25
@@ -85,66 +76,6 @@ MOST_GAIN_STEP = 1.0
 _NO_GAINS = np.zeros(0)
 LENGTHS = (1.0, 0.5, 0.25, 0.1, 0.03)
 """Of the line search, as shares of the full step."""
-
-
-@dataclass(frozen=True)
-class State:
-    """What is fitted: table [R, 4] of one operator, its mean [4] or [V, 4], and the shared parameters.
-
-    Without an operator the mean is all there is.
-    """
-
-    operator: HashOperator | None
-    mean: Tensor
-    table: Tensor | None
-    shared: Globals
-
-    @property
-    def raw(self) -> Tensor:
-        """θ = θ̄ + A·table, [V, 4]."""
-        return self.mean if self.operator is None else self.mean + self.operator(self.table)
-
-    @property
-    def textured(self) -> bool:
-        """Whether places may differ in their materials: before the first step they do not."""
-        return self.mean.dim() == 2 or bool(self.table.any())
-
-    @property
-    def materials(self) -> Tensor:
-        """Base colour and roughness of every vertex, [V, 4]."""
-        raw = self.raw
-        low, high = ROUGHNESS_RANGE
-        return torch.cat(
-            [self._shown(raw) ** (1 / self.shared.gamma), low + (high - low) * torch.sigmoid(raw[:, 3:])],
-            dim=1,
-        )
-
-    @property
-    def link_slope(self) -> Tensor:
-        """d materials / dθ, [V, 4]. Base colour keeps its slope at the clamp, so that it can come back."""
-        raw, gamma = self.raw, self.shared.gamma
-        low, high = ROUGHNESS_RANGE
-        s = torch.sigmoid(raw[:, 3:])
-        return torch.cat([self._shown(raw) ** (1 / gamma - 1) / gamma, (high - low) * s * (1 - s)], dim=1)
-
-    def _shown(self, raw: Tensor) -> Tensor:
-        """Base colour as displayed, b^γ [V, 3]: the form in which it is fitted, since there the photo is
-        linear in it.
-        """
-        low, high = (bound**self.shared.gamma for bound in COLOR_RANGE)
-        return raw[:, :3].clamp(low, high)
-
-
-def roughness_to_raw(roughness: float) -> float:
-    low, high = ROUGHNESS_RANGE
-    share = (roughness - low) / (high - low)
-    return float(np.log(share / (1 - share)))
-
-
-def roughness_slope(roughness: Tensor) -> Tensor:
-    """d roughness / d logit."""
-    low, high = ROUGHNESS_RANGE
-    return (roughness - low) * (high - roughness) / (high - low)
 
 
 def prior_precision(operator: HashOperator, unit_mm: float) -> Tensor:
@@ -451,69 +382,6 @@ def unusual(shared: Globals) -> list[str]:
             edge = "the edge of what is tried, " if at_edge else ""
             found.append(f"{name} {value:.3f} ({edge}usually {low:.3f} to {high:.3f})")
     return found
-
-
-def too_dark(state: State) -> bool:
-    """Whether light between tissue asks for darker tissue than there is."""
-    return brightest(state) * math.exp(state.shared.log_scale) < DARKEST
-
-
-def without_furnace(state: State) -> State:
-    """``state`` with the albedo's scale such that the brightest tissue reflects at most BRIGHTEST."""
-    limit = math.log(BRIGHTEST / brightest(state))
-    return state if state.shared.log_scale <= limit else rescaled(state, limit)
-
-
-def room_below_furnace(state: State, step: float) -> float:
-    """The share of a ``step`` of the albedo's log scale, at most 1, after which the tissue is no furnace."""
-    room = math.log(BRIGHTEST / brightest(state)) - state.shared.log_scale
-    return 1.0 if step <= room else max(room, 0.0) / step
-
-
-def brightest(state: State) -> float:
-    """98th percentile of the brightest albedo channel, unscaled."""
-    return float(np.percentile(state.materials[:, :3].amax(dim=1).cpu().numpy(), 98))
-
-
-def as_bouncing(state: State, before: State) -> State:
-    """``state`` with the albedo's scale such that light bounces as a step from ``before`` has found it.
-
-    A step takes the bounce for that of the old base colours, seen through the new response and scaled: what
-    the colours have gained since would bounce on top, and scale and colours would swing against each other
-    from step to step.
-    """
-    old = replace(before, shared=state.shared).materials[:, :3]
-    gained = (state.materials[:, :3].mean(dim=0) / old.mean(dim=0)).log().mean()
-    return rescaled(state, state.shared.log_scale - float(gained))
-
-
-def halfway(state: State, other: State) -> State:
-    """The state between two of one operator and mean."""
-    vector = (state.shared.vector + other.shared.vector) / 2
-    shared = replace(other.shared, vector=vector)
-    return replace(other, table=(state.table + other.table) / 2, shared=shared)
-
-
-def mixed(mixing: Mixing, state: State, moved: State) -> State:
-    """``moved``, to which a step has led from ``state``, as those before it say that it should go on."""
-    point, image = (
-        np.r_[each.table.flatten().double().numpy(), each.shared.log_scale] for each in (state, moved)
-    )
-    found = mixing.mixed(point, image)
-    table = torch.from_numpy(found[:-1]).float().reshape(moved.table.shape)
-    return rescaled(replace(moved, table=table), float(found[-1]))
-
-
-def rescaled(state: State, log_scale: float) -> State:
-    """``state`` with another scale of the albedo."""
-    vector = state.shared.vector.clone()
-    vector[-1] = log_scale
-    return replace(state, shared=bounded(state.shared, vector))
-
-
-def bounded(shared: Globals, vector: Tensor) -> Globals:
-    limits = torch.tensor(GLOBAL_RANGE, dtype=torch.float64)[: len(vector)]
-    return replace(shared, vector=torch.clamp(vector, limits[:, 0], limits[:, 1]))
 
 
 def _squared(matrix: Tensor) -> Tensor:

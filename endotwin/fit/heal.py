@@ -9,7 +9,7 @@ import scipy.sparse
 import torch
 from scipy.sparse.linalg import spsolve
 
-from endotwin.fit.gauss_newton import State
+from endotwin.fit.state import State
 from endotwin.fusion.smooth import neighbour_mean
 from endotwin.pixels.samples import Samples
 from endotwin.surface import Surface

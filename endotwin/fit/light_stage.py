@@ -18,20 +18,12 @@ from endotwin.evidence.coat import judged as judged_coat
 from endotwin.evidence.tone import Hues, steadied
 from endotwin.evidence.tone import judged as judged_tone
 from endotwin.fit.faint import Faint
-from endotwin.fit.gauss_newton import (
-    GaussNewton,
-    State,
-    as_bouncing,
-    halfway,
-    mixed,
-    roughness_to_raw,
-    too_dark,
-    without_furnace,
-)
+from endotwin.fit.gauss_newton import GaussNewton
 from endotwin.fit.hashgrid import HashGrid, HashOperator
 from endotwin.fit.lighting import Relighting
 from endotwin.fit.mixing import Mixing
 from endotwin.fit.model import Globals, at_pixels
+from endotwin.fit.state import State, as_bouncing, halfway, mixed, roughness_to_raw, too_dark, without_furnace
 from endotwin.fit.within import Renewed, Within
 from endotwin.light.shading import F0_DIELECTRIC, ROUGHNESS_TISSUE
 from endotwin.pixels.length_unit import unit_mm

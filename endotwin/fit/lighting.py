@@ -15,9 +15,10 @@ from endotwin.effects import Effects
 from endotwin.effects.gain import Gain
 from endotwin.effects.offset import Offset
 from endotwin.fit.faint import NOTHING, Faint
-from endotwin.fit.gauss_newton import HUBER, MOST_GAIN_STEP, GaussNewton, State
+from endotwin.fit.gauss_newton import HUBER, MOST_GAIN_STEP, GaussNewton
 from endotwin.fit.model import Globals, at_pixels, slope_by_log_exposure
 from endotwin.fit.normal_equations import CHUNK, Residual
+from endotwin.fit.state import State
 from endotwin.fit.within import Renewed, Varied
 from endotwin.light.bounced import GAMMA_STEP, Albedo, BouncedLight, Places
 from endotwin.light.guides import AT_LENS, COSINE, Guided, guided, log_axis, visible_in_views

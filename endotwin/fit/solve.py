@@ -23,11 +23,12 @@ from endotwin.evidence.glints import Glints
 from endotwin.fit.bloom import bloom
 from endotwin.fit.faint import NOTHING, Faint
 from endotwin.fit.film import Found, Model
-from endotwin.fit.gauss_newton import CPU, GaussNewton, State, unusual
+from endotwin.fit.gauss_newton import CPU, GaussNewton, unusual
 from endotwin.fit.hashgrid import HashGrid, HashOperator
 from endotwin.fit.light_stage import Cost, FoundLight, LightStage
 from endotwin.fit.lighting import Relighting, lit
 from endotwin.fit.sparkle import sparkle
+from endotwin.fit.state import State
 from endotwin.fit.tilt import Tilter
 from endotwin.fit.unexplained import Remains, cast_warning, residual_warning
 from endotwin.light.film import Film

@@ -14,9 +14,10 @@ import torch
 from torch import Tensor
 
 from endotwin.effects import Effects
-from endotwin.fit.gauss_newton import HUBER, TEMPER, GaussNewton, State, conjugate_gradients
+from endotwin.fit.gauss_newton import HUBER, TEMPER, GaussNewton, conjugate_gradients
 from endotwin.fit.model import at_pixels, predict
 from endotwin.fit.normal_equations import CHUNK, Residual, add_products, pairs_of
+from endotwin.fit.state import State
 from endotwin.light.guides import guided
 from endotwin.light.incidence import COS_MIN
 from endotwin.pixels.samples import Samples

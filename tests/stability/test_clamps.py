@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from endotwin.fit.gauss_newton import COLOR_RANGE, State
 from endotwin.fit.model import Globals
+from endotwin.fit.state import COLOR_RANGE, State
 from endotwin.light import shading
 from endotwin.light.incidence import COS_MIN, DISTANCE_MIN_MM, incidence_on
 from endotwin.surface.casting import Correspondences
