@@ -98,7 +98,7 @@ def uncounted(true: list[str], levels: dict[str, float]) -> list[str]:
     """Effects of which this scene's photos cannot tell whether they are there."""
     faint = {name for name in true if levels[name] < LEAST_LEVELS}
     angular = {"profile", "vignetting"}
-    if faint & angular or ("vignetting" in true and "offset" not in true):
+    if faint & angular or ("vignetting" in true and not {"offset", "interreflection"} & set(true)):
         faint |= angular
     if "offset" in faint:
         faint.add("shadows")

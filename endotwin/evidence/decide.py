@@ -133,11 +133,13 @@ class _Trial:
         return self._model(kept)
 
     def _seek_guides(self, best: frozenset[str]) -> None:
-        """Find the guides without and with bounced light, if there are any beside the best set without them;
-        at last beside the bounce of their own light.
+        """Find the guides without and with bounced light, if there are any beside the ``best`` set without
+        them; at last beside the bounce of their own light.
 
-        Where bounced light is left out, a guide near the lens throws into the shadows what nothing else does.
+        A gain that is not worth its place would explain what guides throw, and hide where they are. Where
+        bounced light is left out, a guide near the lens throws into the shadows what nothing else does.
         """
+        best, _ = self._pruned(best, ("gain",))
         base = replace(self._model(best).hypothesis, vignetting=self.wanted("vignetting") != "off")
         found_mm = self._found_guides(base, self.wanted("offset") == "on")
         bounces = base.bounced is not None
@@ -181,15 +183,21 @@ class _Trial:
         began = time.perf_counter()
         other = self._mixed(kept) if name == "profile" else replace(kept.hypothesis, vignetting=True)
         other = self._probe.fit(other)
-        verdict = self._probe.compare(kept, other)
+        verdict = self._verdict_beside(name, kept, other)
         on = self.wanted(name) == "on" or _worth(name, verdict)
         if on and other.hypothesis.guides_mm != AT_LENS:
             kept, other = self._settled(kept), self._settled(other)
-            verdict = self._probe.compare(kept, other)
+            verdict = self._verdict_beside(name, kept, other)
             on = self.wanted(name) == "on" or _worth(name, verdict)
         self._say(name, on, verdict)
         self._seconds[name] += time.perf_counter() - began
         return other if on else kept
+
+    def _verdict_beside(self, name: str, kept: Fitted, other: Fitted) -> Verdict:
+        """On ``other``, which has the effect ``name`` as well. No endoscope's lens brightens the rim."""
+        verdict = self._probe.compare(kept, other)
+        brightens = name == "vignetting" and other.vignetting > 0
+        return replace(verdict, possible=verdict.possible and not brightens)
 
     def without_idle_gain(self, kept: Fitted) -> Fitted:
         """``kept``, or the same without a gain that had stood for what was found beside it since."""
@@ -263,11 +271,14 @@ class _Trial:
 
         return max(sets, key=score_db)
 
-    def _pruned(self, names: frozenset[str]) -> tuple[frozenset[str], dict[str, Verdict]]:
-        """``names`` less what is not worth its place, the least worth first; and the verdicts on the rest."""
+    def _pruned(
+        self, names: frozenset[str], free: tuple[str, ...] = TOGETHER
+    ) -> tuple[frozenset[str], dict[str, Verdict]]:
+        """``names`` less those of ``free`` that are not worth their place, the least worth first; and the
+        verdicts on the rest."""
         while True:
             verdicts = {name: self._verdict(names - {name}, names) for name in names}
-            unworthy = [name for name in names if self.wanted(name) == "auto"]
+            unworthy = [name for name in names if name in free and self.wanted(name) == "auto"]
             unworthy = [name for name in unworthy if not self._worth_within(names, name, verdicts[name])]
             if not unworthy:
                 return names, verdicts
@@ -293,7 +304,8 @@ class _Trial:
         if len(self._probe) == 0:
             return False
         if name == "vignetting":
-            return kept.hypothesis.guides_mm != AT_LENS
+            model = kept.hypothesis
+            return model.guides_mm != AT_LENS or model.bounced is not None
         return name != "gain" or len(self._probe.frames) > 1
 
     def _mixed(self, kept: Fitted) -> Hypothesis:
@@ -318,7 +330,7 @@ class _Trial:
         else:
             reason = {
                 "offset": "no position of one to three guides predicts better",
-                "vignetting": "with the light at the lens its profile says the same of every pixel",
+                "vignetting": "with all light from the lens its profile says the same of every pixel",
                 "gain": "a single frame has no other to be brighter than",
             }.get(name, "the photos show too little")
         self._decisions[name] = Decision("on" if on else "off", reason, gain_db)

@@ -17,6 +17,7 @@ from endotwin.evidence.decide import decide
 from endotwin.evidence.glints import Glints
 from endotwin.evidence.guide_search import found_guides
 from endotwin.evidence.probe import Hypothesis, Probe
+from endotwin.light.guides import AT_LENS
 from endotwin.pipeline import fuse_twin
 from endotwin.pixels.pace import Pace
 from endotwin.pixels.samples import gather
@@ -127,6 +128,22 @@ def test_a_profile_forced_on_a_cosine_stays_one(example):
     assert decided.light.n == pytest.approx(2, rel=0.05)
 
 
+def test_guides_are_sought_beside_no_gain_that_is_not_worth_its_place(example, monkeypatch):
+    """It would explain what guides throw, and hide them."""
+    twin, caster, samples, glints = example
+    log_gain = np.random.default_rng(3).normal(0, 0.005, 64)
+    bases = []
+
+    def found(probe, base, *_):
+        bases.append(base)
+        return AT_LENS
+
+    monkeypatch.setattr("endotwin.evidence.decide.found_guides", found)
+    decided = decide(brightened(samples, log_gain), twin, caster, glints, {})
+    assert decided.decisions["gain"].state == "off" and decided.decisions["gain"].gain_db > 0
+    assert bases and not any(base.gain for base in bases)
+
+
 def test_an_effect_that_is_forced_off_stays_off(example):
     twin, caster, samples, glints = example
     log_gain = np.random.default_rng(3).normal(0, 0.15, 64)
@@ -135,10 +152,24 @@ def test_an_effect_that_is_forced_off_stays_off(example):
     assert decided.decisions["gain"].reason == "forced off"
 
 
+@pytest.fixture(scope="module")
+def bouncing():
+    return scene(DATA / "colon_gi", 0.5)
+
+
 @needs_data
-def test_interreflection_turns_itself_on_in_a_tube_that_has_it():
-    decided = decide(*reordered(scene(DATA / "colon_gi", 0.5)), {})
+def test_interreflection_turns_itself_on_in_a_tube_that_has_it(bouncing):
+    decided = decide(*reordered(bouncing), {})
     assert states(decided) == {**dict.fromkeys(LIGHT, "off"), "interreflection": "on"}
+
+
+@needs_data
+def test_vignetting_is_told_from_the_profile_of_a_light_at_the_lens_by_what_bounces(bouncing):
+    twin, caster, samples, glints = bouncing
+    decided = decide(vignetted(samples, twin, Vignetting(-0.5)), twin, caster, glints, {})
+    on = dict.fromkeys(("interreflection", "vignetting"), "on")
+    assert states(decided) == {**dict.fromkeys(LIGHT, "off"), **on}
+    assert decided.effects["vignetting"].k2 == pytest.approx(-0.5, abs=0.1)
 
 
 def test_guides_that_stand_far_out_for_how_near_the_wall_is_are_found(tmp_path):
