@@ -41,9 +41,11 @@ class Codec(Effect):
     @classmethod
     def evidence(cls, sequence: Sequence) -> tuple[Codec | None, str]:
         """Of JPEG files by their own tables, of others by what a JPEG's steps left in their pixels."""
-        files = sequence.color_files[:: max(len(sequence) // FILES, 1)]
-        qualities = [quality_of(file) for file in files] if sequence.scale == 1 else [None]
-        if None in qualities:
-            return None, "rendered on request: the photos are no JPEG files and show no steps of one"
+        qualities = []
+        for file in sequence.color_files[:: max(len(sequence) // FILES, 1)]:
+            quality = quality_of(file) if sequence.scale == 1 else None
+            if quality is None:
+                return None, "rendered on request: the photos are no JPEG files and show no steps of one"
+            qualities.append(quality)
         quality = float(np.median(qualities))
         return cls(quality), f"the photos were coded as JPEG pictures of quality {quality:g}"
