@@ -58,8 +58,8 @@ class Hues:
 def judged(without: Callable[[Tone], Hues], wanted: str) -> tuple[Tone | None, Decision]:
     """The tone curve that the hues call for, or that is ``wanted`` (auto, on or off); and why.
 
-    Where light bounces they have to call for one beside a bounce of any strength, too, and plainly: what the
-    bounce lacks turns hues as well.
+    Where light bounces they have to call for one beside a bounce of any strength, too: what the bounce
+    lacks turns hues as well.
 
     Args:
         without: the hues, by the curve that is taken off.
@@ -73,8 +73,7 @@ def judged(without: Callable[[Tone], Hues], wanted: str) -> tuple[Tone | None, D
         f"a contrast of {curve.contrast:.2f} predicts held-out hues better by {each}"
         for curve, each in trials
     )
-    sure = verdict.sigmas >= MIN_SIGMAS and all(each.hints for _, each in trials[1:])
-    sure = sure and min(curve.contrast for curve, _ in trials) >= LEAST_CONTRAST
+    sure = all(each.sigmas >= MIN_SIGMAS and curve.contrast >= LEAST_CONTRAST for curve, each in trials)
     gain_db, took_s = round(verdict.gain_db, 3), round(time.perf_counter() - began, 3)
     if wanted == "auto" and not sure:
         return None, Decision("off", f"none that counts: {told}", gain_db, took_s)

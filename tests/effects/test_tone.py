@@ -1,5 +1,7 @@
 """The tone curve against closed forms, and what hues say of it."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -73,6 +75,29 @@ def test_no_curve_is_found_where_there_is_none(seed):
 
 def test_dark_places_that_are_redder_are_no_curve():
     assert judged(hues_of(-0.4), "auto")[0] is None
+
+
+def beside_a_bounce(contrast: float, strength: float = 0.0):
+    """The hues of a curve, turned as well by ``strength`` of a bounce that turns them nearly as curves do."""
+    hues = hues_of(contrast)
+
+    def without(tone: Tone) -> Hues:
+        found = hues(tone)
+        curve = found.slopes[:, -1]
+        bounce = curve + 0.07 * curve.std() * np.random.default_rng(5).standard_normal(len(curve))
+        slopes = np.c_[found.slopes[:, :-1], bounce, curve]
+        return replace(found, residual=found.residual + strength * bounce, slopes=slopes)
+
+    return without
+
+
+def test_a_curve_is_found_beside_a_bounce_that_turns_hues_nearly_as_it_does():
+    tone, decision = judged(beside_a_bounce(0.3), "auto")
+    assert decision.state == "on" and tone.contrast == pytest.approx(0.3, abs=0.03)
+
+
+def test_a_bounce_of_another_strength_is_no_curve():
+    assert judged(beside_a_bounce(0.0, strength=0.3), "auto")[0] is None
 
 
 def test_a_curve_is_on_and_off_as_it_is_asked_for():
