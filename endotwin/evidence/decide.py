@@ -30,7 +30,7 @@ from endotwin.evidence.bounce import bounced, cell_mm
 from endotwin.evidence.glints import Glints
 from endotwin.evidence.guide_search import Guides, Search, found_guides, polished, settled
 from endotwin.evidence.log_light import Bounced
-from endotwin.evidence.probe import MIN_IMPOSSIBLE_DB, Fitted, Hypothesis, Probe, Verdict
+from endotwin.evidence.probe import MIN_IMPOSSIBLE_DB, MIN_SIGMAS, Fitted, Hypothesis, Probe, Verdict
 from endotwin.light.guides import AT_LENS, COSINE, EXPONENTIAL
 from endotwin.pixels.samples import Samples
 from endotwin.pixels.start import PRIOR
@@ -163,14 +163,16 @@ class _Trial:
         return self._guides_mm[False] != AT_LENS
 
     def shadowed(self, kept: Fitted) -> Fitted:
-        """``kept``, whose guides cast shadows, or the same without them if no held-out pixel shows any."""
+        """``kept``, whose guides cast shadows, or the same without them where no pixel lies in one, or the
+        probe's plainly contradict it: few tell, and that guides beside the lens cast shadows is certain."""
         if kept.hypothesis.guides_mm == AT_LENS:
             reason = "light at the lens casts no shadow that the lens sees"
             self._decisions["shadows"] = Decision("off", reason)
             return kept
         unshadowed = self._probe.fit(replace(kept.hypothesis, shadows=False))
         verdict = self._probe.told_by_shadows(kept, unshadowed)
-        on = self.wanted("shadows") == "on" or (self.wanted("shadows") == "auto" and verdict.keep)
+        cast = self._probe.in_shadow(kept.hypothesis.guides_mm) and verdict.sigmas > -MIN_SIGMAS
+        on = self.wanted("shadows") == "on" or (self.wanted("shadows") == "auto" and cast)
         self._say("shadows", on, verdict)
         return kept if on else unshadowed
 
@@ -325,6 +327,8 @@ class _Trial:
         elif on:
             forced = "forced on; " if self.wanted(name) == "on" else ""
             reason = f"{forced}predicts held-out pixels better by {verdict}"
+            if not forced and verdict.gain_db < 0:
+                reason = f"certain beside guides, and no held-out pixels plainly contradict it ({verdict})"
         elif verdict is not None:
             reason = f"does not predict held-out pixels better ({verdict})"
         else:

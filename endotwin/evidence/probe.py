@@ -173,7 +173,7 @@ class Probe(Sightings):
     """
 
     def __init__(self, samples: Samples, twin: Twin, caster: Caster, pixels: int = PIXELS, seed: int = 0):
-        surface = twin.surface
+        surface, self._every = twin.surface, samples
         generator = np.random.default_rng(seed)
         rows, every = np.flatnonzero(diffuse(samples)), samples.nearest(surface.triangles)
         chosen = whole_groups(every[rows], len(surface.vertices_mm), pixels, generator, LEAST_PIXELS)
@@ -225,6 +225,11 @@ class Probe(Sightings):
         designs = base.design, other.design
         verdict = compared(self.target, *designs, self._half, base.effects.width, len(self.frames))
         return replace(verdict, possible=other.possible or not base.possible)
+
+    def in_shadow(self, guides_mm: tuple[tuple[float, float, float], ...]) -> bool:
+        """Whether any of the guides fails to see any of all pixels, of the probe or not."""
+        every = Sightings(self._every, np.zeros(len(self._every), int), self.twin, self.caster)
+        return not every.visible_to(guides_mm).all()
 
     def told_by_shadows(self, cast: Fitted, uncast: Fitted) -> Verdict:
         """How much better ``cast`` shows the photos than ``uncast``, the same without shadows.

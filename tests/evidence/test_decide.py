@@ -13,7 +13,7 @@ from independent.write import make
 
 from endotwin.config import STANDARD
 from endotwin.effects.vignetting import Vignetting
-from endotwin.evidence.decide import decide
+from endotwin.evidence.decide import _Trial, decide
 from endotwin.evidence.glints import Glints
 from endotwin.evidence.guide_search import found_guides
 from endotwin.evidence.probe import Hypothesis, Probe
@@ -201,6 +201,24 @@ def test_guides_are_found_from_near_them_as_from_nowhere(lit_from_beside):
     near_mm = tuple(map(tuple, np.add(GUIDES_MM, [[0.6, -0.4, 0.0], [-0.5, 0.5, -0.3]])))
     decided = decide(*reordered(lit_from_beside), {}, near_mm=near_mm)
     np.testing.assert_allclose(sorted(decided.effects["offset"].guides_mm), GUIDES_MM, atol=0.5)
+
+
+@needs_data
+def test_shadows_are_cast_by_guides_unless_no_pixel_lies_in_one_or_many_contradict_them(lit_from_beside):
+    twin, caster, samples, glints = lit_from_beside
+
+    def state(samples, guides_mm) -> str:
+        probe = Probe(samples, twin, caster)
+        trial = _Trial(probe, glints, {}, lambda: False, AT_LENS)
+        trial.shadowed(probe.fit(Hypothesis(tuple(map(tuple, guides_mm)), shadows=True)))
+        return trial._decisions["shadows"].state
+
+    probe = Probe(samples, twin, caster)
+    shaded = probe._rows[~probe.visible_to(GUIDES_MM).all(axis=1)]
+    few = samples[torch.from_numpy(np.delete(np.arange(len(samples)), shaded[20:]))]
+    assert state(samples, GUIDES_MM) == "on" and state(few, GUIDES_MM) == "on"
+    assert state(samples, np.multiply(GUIDES_MM, [0.01, 0.01, 1])) == "off"
+    assert state(samples, np.multiply(GUIDES_MM, 3)) == "off"
 
 
 @needs_data
