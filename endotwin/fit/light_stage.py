@@ -60,6 +60,9 @@ SETTLING = 4
 LEAVING = 2
 """Steps in which light learns to do without what is faint, before the materials do."""
 
+MISSES = 2
+"""After so many steps by what varies that lead to nothing better, there is none more."""
+
 CONVERGED = 2e-4
 """A step that changes the cost by a smaller share than this is the last."""
 
@@ -190,29 +193,30 @@ class LightStage:
                 self._state = self._relighting.without_bounce(self._solver, self._state)
                 return None
             if number >= BOUNCE_COAT_STEP:
-                best = self._better(best, self._state)
+                best = self._better(best)
             number = self._next(number, BOUNCE_STEPS, gain, BOUNCE_COAT_STEP)
         if best is not None:
             self._take_best(self._by_what_varies(best))
         self._without_faint((*self._undetermined, *BOUNCE_HELD, "albedo scale", "gamma"))
         return None
 
-    def _by_what_varies(self, best: Best) -> Best:
-        """Light and response by what varies within vertices, beside a bounce of the strength that was found,
-        for as long as all pixels say that it is better: coarse albedo bends γ, and what a video processor
-        does to colours bends what varies."""
+    def _by_what_varies(self, joint: Best) -> Best:
+        """Light and response by what varies within vertices, beside a bounce of the strength that was found
+        in ``joint`` steps, unless all pixels say that this is plainly worse: coarse albedo bends γ, and what
+        a video processor does to colours bends what varies. A step may lead over worse ones to better."""
         held = (*self._undetermined, *BOUNCE_HELD, "albedo scale")
-        self._take_best(best)
-        best = self._better(None, self._state)
+        self._take_best(joint)
+        joint, best, missed = self._better(None), None, 0
         for _ in range(STEPS):
-            if self._pace.light_is_over():
+            if self._pace.light_is_over() or missed == MISSES:
                 break
-            self._renew(self._state.shared, held, best.noise)
+            self._renew(self._state.shared, held, joint.noise)
             self._settle()
-            before, best = best, self._better(best, self._state)
-            if before.cost - best.cost < CONVERGED * before.cost:
+            before, best = best, self._better(best, joint.noise)
+            missed = missed + 1 if best is before else 0
+            if before is not None and 0 < before.cost - best.cost < CONVERGED * before.cost:
                 break
-        return best
+        return joint if best is None or best.cost > WORSE * joint.cost else best
 
     def _settle(self) -> None:
         """Materials beside a bounce, until they and what they throw on each other agree."""
@@ -324,13 +328,14 @@ class LightStage:
         layer, self._decisions["coat"] = judged_coat(highlights, self._wanted["coat"])
         return replace(state.shared, coat=layer)
 
-    def _better(self, best: Best | None, state: State) -> Best:
-        """``state``, by which the samples are lit, or the ``best`` so far if that costs less."""
-        noise = self._solver.noise(state) if best is None else best.noise
-        cost = self._solver.cost(state, noise)
+    def _better(self, best: Best | None, noise: float | None = None) -> Best:
+        """The state, by which the samples are lit, or the ``best`` so far if that costs less; held to that
+        best's noise, or to ``noise``, or to its own."""
+        noise = best.noise if best is not None else noise or self._noise
+        cost = self._solver.cost(self._state, noise)
         if best is not None and best.cost <= cost:
             return best
-        return Best(state, self._relighting.effects, self._relighting.faint, cost, noise)
+        return Best(self._state, self._relighting.effects, self._relighting.faint, cost, noise)
 
     def _stepped(self, state: State, joint: bool, mixing: Mixing | None = None) -> tuple[State, float]:
         """A step, of the materials alone where a ``joint`` one finds nothing lower, with the samples relit by
