@@ -52,7 +52,8 @@ BOUNCE_HELD = ("q", "L0")
 off a mesh errs by would bend it, and γ with it. L0 is told by the albedo's scale."""
 
 WORSE, HALVINGS = 1.25, 2
-"""A step under whose light the photos cost so many times what they did is too long, and halved so often."""
+"""A step under whose light the photos cost so many times what they did is too long, and halved so often; by
+what varies no light is taken under which they cost so many times what they do under that of joint steps."""
 
 SETTLING = 4
 """Steps at most of the materials under a light that was found beside a bounce."""
