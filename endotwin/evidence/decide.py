@@ -30,7 +30,15 @@ from endotwin.evidence.bounce import bounced, cell_mm
 from endotwin.evidence.glints import Glints
 from endotwin.evidence.guide_search import Guides, Search, found_guides, polished, settled
 from endotwin.evidence.log_light import Bounced
-from endotwin.evidence.probe import MIN_IMPOSSIBLE_DB, MIN_SIGMAS, Fitted, Hypothesis, Probe, Verdict
+from endotwin.evidence.probe import (
+    MIN_GAIN_DB,
+    MIN_IMPOSSIBLE_DB,
+    MIN_SIGMAS,
+    Fitted,
+    Hypothesis,
+    Probe,
+    Verdict,
+)
 from endotwin.light.guides import AT_LENS, COSINE, EXPONENTIAL
 from endotwin.pixels.samples import Samples
 from endotwin.pixels.start import PRIOR
@@ -163,15 +171,16 @@ class _Trial:
         return self._guides_mm[False] != AT_LENS
 
     def shadowed(self, kept: Fitted) -> Fitted:
-        """``kept``, whose guides cast shadows, or the same without them where no pixel lies in one, or the
-        probe's plainly contradict it: few tell, and that guides beside the lens cast shadows is certain."""
+        """``kept``, whose guides cast shadows, or the same without them where too few pixels lie in one, or
+        the probe's plainly contradict it: few tell, and that guides beside the lens cast shadows is certain.
+        """
         if kept.hypothesis.guides_mm == AT_LENS:
             reason = "light at the lens casts no shadow that the lens sees"
             self._decisions["shadows"] = Decision("off", reason)
             return kept
         unshadowed = self._probe.fit(replace(kept.hypothesis, shadows=False))
         verdict = self._probe.told_by_shadows(kept, unshadowed)
-        cast = self._probe.in_shadow(kept.hypothesis.guides_mm) and verdict.sigmas > -MIN_SIGMAS
+        cast = self._probe.shaded_db(kept) >= MIN_GAIN_DB and verdict.sigmas > -MIN_SIGMAS
         on = self.wanted("shadows") == "on" or (self.wanted("shadows") == "auto" and cast)
         self._say("shadows", on, verdict)
         return kept if on else unshadowed

@@ -226,10 +226,12 @@ class Probe(Sightings):
         verdict = compared(self.target, *designs, self._half, base.effects.width, len(self.frames))
         return replace(verdict, possible=other.possible or not base.possible)
 
-    def in_shadow(self, guides_mm: tuple[tuple[float, float, float], ...]) -> bool:
-        """Whether any of the guides fails to see any of all pixels, of the probe or not."""
+    def shaded_db(self, found: Fitted) -> float:
+        """By how much the mean square of what ``found`` leaves would grow if nothing explained the shadows
+        of its guides, each a share of the light, in all pixels, of the probe or not."""
         every = Sightings(self._every, np.zeros(len(self._every), int), self.twin, self.caster)
-        return not every.visible_to(guides_mm).all()
+        lost = 1 - every.visible_to(found.hypothesis.guides_mm).mean(axis=1)
+        return 10 * math.log10(1 + float(((found.gamma * lost) ** 2).mean()) / found.effects.width**2)
 
     def told_by_shadows(self, cast: Fitted, uncast: Fitted) -> Verdict:
         """How much better ``cast`` shows the photos than ``uncast``, the same without shadows.

@@ -204,7 +204,9 @@ def test_guides_are_found_from_near_them_as_from_nowhere(lit_from_beside):
 
 
 @needs_data
-def test_shadows_are_cast_by_guides_unless_no_pixel_lies_in_one_or_many_contradict_them(lit_from_beside):
+def test_shadows_are_cast_by_guides_unless_hardly_a_pixel_lies_in_one_or_many_contradict_them(
+    lit_from_beside,
+):
     twin, caster, samples, glints = lit_from_beside
 
     def state(samples, guides_mm) -> str:
