@@ -286,10 +286,11 @@ class _Trial:
         self, names: frozenset[str], free: tuple[str, ...] = TOGETHER
     ) -> tuple[frozenset[str], dict[str, Verdict]]:
         """``names`` less those of ``free`` that are not worth their place, the least worth first; and the
-        verdicts on the rest."""
+        verdicts on those of ``free`` that are."""
         while True:
-            verdicts = {name: self._verdict(names - {name}, names) for name in names}
-            unworthy = [name for name in names if name in free and self.wanted(name) == "auto"]
+            judged = names.intersection(free)
+            verdicts = {name: self._verdict(names - {name}, names) for name in judged}
+            unworthy = [name for name in judged if self.wanted(name) == "auto"]
             unworthy = [name for name in unworthy if not self._worth_within(names, name, verdicts[name])]
             if not unworthy:
                 return names, verdicts

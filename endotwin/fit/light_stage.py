@@ -6,6 +6,7 @@ depends on the materials, so that both are found in one step; what varies has th
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
@@ -207,17 +208,18 @@ class LightStage:
         a video processor does to colours bends what varies. A step may lead over worse ones to better."""
         held = (*self._undetermined, *BOUNCE_HELD, "albedo scale")
         self._take_best(joint)
-        joint, best, missed = self._better(None), None, 0
+        joint, missed = self._better(None), 0
+        best = replace(joint, cost=math.inf)
         for _ in range(STEPS):
             if self._pace.light_is_over() or missed == MISSES:
                 break
             self._renew(self._state.shared, held, joint.noise)
             self._settle()
-            before, best = best, self._better(best, joint.noise)
+            before, best = best, self._better(best)
             missed = missed + 1 if best is before else 0
-            if before is not None and 0 < before.cost - best.cost < CONVERGED * before.cost:
+            if 0 < before.cost - best.cost < CONVERGED * before.cost:
                 break
-        return joint if best is None or best.cost > WORSE * joint.cost else best
+        return joint if best.cost > WORSE * joint.cost else best
 
     def _settle(self) -> None:
         """Materials beside a bounce, until they and what they throw on each other agree."""
@@ -329,10 +331,9 @@ class LightStage:
         layer, self._decisions["coat"] = judged_coat(highlights, self._wanted["coat"])
         return replace(state.shared, coat=layer)
 
-    def _better(self, best: Best | None, noise: float | None = None) -> Best:
-        """The state, by which the samples are lit, or the ``best`` so far if that costs less; held to that
-        best's noise, or to ``noise``, or to its own."""
-        noise = best.noise if best is not None else noise or self._noise
+    def _better(self, best: Best | None) -> Best:
+        """The state, by which the samples are lit, or the ``best`` so far if that costs less."""
+        noise = self._noise if best is None else best.noise
         cost = self._solver.cost(self._state, noise)
         if best is not None and best.cost <= cost:
             return best
