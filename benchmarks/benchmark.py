@@ -3,6 +3,7 @@
     python benchmarks/benchmark.py DATA/colon_direct
     python benchmarks/benchmark.py DATA/colon_direct --config draft --config fine
     python benchmarks/benchmark.py DATA/colon_direct --method endopbr --budget 60s
+    python benchmarks/benchmark.py DATA/colon_direct --device cuda
 
 Each command runs in its own process from cold files, so that its seconds and its peak memory are its own.
 Only this script reads the truth (``truth/``: albedo and roughness of some frames; ``made.json``: the light).
@@ -107,14 +108,17 @@ def benchmark(
         "fuse", sequence, "-o", twin_folder, "--overwrite", *protocol, *scale, profile=profile
     )
     learn = ["--method", method, "--config", config, *budget, "--seed", options.seed]
+    learn += ["--device", options.device]
     _, fit_s, fit = run("fit", twin_folder, *learn, profile=profile)
     printed, eval_s, _ = run("eval", twin_folder, "--json", "--scale", 1, profile=profile)
     scores, twin = json.loads(printed), Twin.load(twin_folder)
     albedo, roughness = material_errors(twin, sequence / "truth")
     true = true_light(json.loads((sequence / "truth" / "made.json").read_text()))
+    named = [method, config if method == "twin" else None, options.budget]
+    named.append(None if options.device == "cpu" else options.device)
     return {
         "sequence": sequence.name,
-        "method": ", ".join(filter(None, [method, config if method == "twin" else None, options.budget])),
+        "method": ", ".join(filter(None, named)),
         "geometry": options.geometry,
         "fuse": f"{fuse_s:.1f} s",
         "fit": f"{fit_s:.1f} s",
@@ -145,6 +149,7 @@ def main() -> None:
     parser.add_argument("--budget", help="time of each fit, as 60s or 10m (default: the config's)")
     parser.add_argument("--geometry", default="known", choices=("known", "heldout"))
     parser.add_argument("--scale", type=float, help="factor on the image size (default: the config's)")
+    parser.add_argument("--device", default="cpu", choices=("cpu", "cuda"), help="that fits (default: cpu)")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--keep", type=Path, metavar="FOLDER", help="keep the twins there")
     options = parser.parse_args()

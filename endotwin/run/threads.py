@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 from endotwin.errors import OptionError
@@ -42,3 +44,19 @@ def device_of(name: str) -> torch.device:
     if name == "cuda" and not there:
         raise OptionError("torch finds no GPU here; install its CUDA build, or choose the device cpu")
     return torch.device("cuda" if there and name != "cpu" else "cpu")
+
+
+@contextmanager
+def one_core() -> Iterator[None]:
+    """Torch and BLAS keep to the calling thread, and to each that is started in the block: small work takes
+    four times as long where they have threads of their own."""
+    import torch
+    from threadpoolctl import threadpool_limits
+
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        with threadpool_limits(1, user_api="blas"):
+            yield
+    finally:
+        torch.set_num_threads(before)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import logging
 from pathlib import Path
+from threading import Lock
 
 import torch
 from torch import nn
@@ -17,6 +18,9 @@ from endotwin.study.depth_anything import WEIGHTS, DepthAnything
 from endotwin.study.small import Small
 
 logger = logging.getLogger("endotwin")
+
+_drawing = Lock()
+"""Held while first weights are drawn: all threads draw from one generator."""
 
 
 def found(asked: str) -> str:
@@ -40,11 +44,13 @@ def network(name: str, seed: int, adapted: bool = True) -> nn.Module:
     Args:
         adapted: whether it will be trained.
     """
-    torch.manual_seed(seed)
     if name == "small":
-        return Small()
+        with _drawing:
+            torch.manual_seed(seed)
+            return Small()
     if Path(name).exists() and not (Path(name) / "config.json").is_file():
         raise OptionError(
             f"{name} has no config.json; give a folder with weights of Depth Anything, or small"
         )
+    torch.manual_seed(seed)
     return DepthAnything(name, adapted)

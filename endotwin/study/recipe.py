@@ -9,7 +9,7 @@ import yaml
 
 TRANSLATION_MM, ROTATION_DEG = 5, 8
 
-OTHER_LENSES = 1 / 3
+OTHER_LENSES = 1 / 5
 """Share of frames that are rendered through other lenses than the twin's own, where a recipe asks for any."""
 
 
@@ -42,7 +42,7 @@ HUE = Recipe(
 
 LENS = Recipe(
     "lens",
-    "a third through the lenses of the test sequences, with the black around their circles",
+    "a fifth through the lenses of the test sequences, with the black around their circles",
     lenses=True,
 )
 

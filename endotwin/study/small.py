@@ -23,9 +23,9 @@ class Small(nn.Module):
 
     name = "small"
     size = (160, 128)
-    batch = 4
-    rate = 2e-3
-    steps = 500
+    batch = 16
+    rate = 1e-3
+    steps = 1500
 
     def __init__(self) -> None:
         super().__init__()

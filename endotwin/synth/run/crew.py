@@ -18,7 +18,7 @@ from threadpoolctl import threadpool_limits
 
 from endotwin.errors import OptionError, OutputError
 from endotwin.run.processes import Pool
-from endotwin.run.threads import cores
+from endotwin.run.threads import cores, one_core
 from endotwin.synth.job import Job
 from endotwin.synth.labels import Labeller
 from endotwin.synth.run.shard import DONE, render_shard
@@ -31,7 +31,7 @@ SCHEDULER_TIMEOUT_S = 15
 
 def render_here(job: Job, folder: Path, shards: Iterable[int]) -> Iterator[int]:
     """Render in this process, one shard after the other."""
-    with _one_core():
+    with one_core():
         labeller = Labeller(job)
         for number in shards:
             render_shard(job, labeller, folder, number)
@@ -195,15 +195,3 @@ def _keep_to_one_core() -> None:
     """Torch and BLAS keep to the calling thread: with threads of their own, a frame takes 4 times as long."""
     torch.set_num_threads(1)
     threadpool_limits(1, user_api="blas")
-
-
-@contextmanager
-def _one_core() -> Iterator[None]:
-    """``_keep_to_one_core`` for the block."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        with threadpool_limits(1, user_api="blas"):
-            yield
-    finally:
-        torch.set_num_threads(before)

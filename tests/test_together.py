@@ -1,0 +1,55 @@
+"""Long jobs at the same time: counted as one, and stopped as one."""
+
+import threading
+
+import pytest
+import torch
+
+from endotwin.run.together import together
+
+
+def test_what_all_jobs_have_done_is_told_and_ends_at_their_sum():
+    told, met = [], threading.Barrier(2, timeout=20)
+
+    def work(job: int, count) -> None:
+        met.wait()  # which fewer than two at a time never pass
+        for amount in range(1, job + 1):
+            count(amount)
+
+    together(work, [3, 5], 2, told.append)
+    assert told == list(range(1, 9))
+
+
+@pytest.mark.parametrize("error", [ValueError, KeyboardInterrupt])
+def test_the_first_error_stops_the_others_at_their_next_count(error):
+    ended, failed = [], threading.Event()
+
+    def work(job: str, count) -> None:
+        if job == "fails":
+            failed.set()
+            raise error("first")
+        failed.wait(20)
+        while True:
+            count(1)
+
+    def forever(job: str, count) -> None:
+        try:
+            work(job, count)
+        finally:
+            ended.append(job)
+
+    with pytest.raises(error, match="first"):
+        together(forever, ["goes on", "fails", "waits"], 2, lambda _: None)
+    assert set(ended) >= {"goes on", "fails"}
+
+
+@pytest.mark.parametrize(("threads", "on_one"), [(1, False), (2, True)])
+def test_jobs_that_are_not_alone_keep_to_one_core_each_and_the_caller_gets_its_threads_back(threads, on_one):
+    before, seen = torch.get_num_threads(), []
+    torch.set_num_threads(3)
+    try:
+        together(lambda job, count: seen.append(torch.get_num_threads()), [1, 2], threads, lambda _: None)
+        assert seen == [1, 1] if on_one else seen == [3, 3]
+        assert torch.get_num_threads() == 3
+    finally:
+        torch.set_num_threads(before)
