@@ -25,8 +25,7 @@ from endotwin.light.guides import AT_LENS, COSINE, Guided, guided, log_axis, vis
 from endotwin.light.mirror import met_mirrored
 from endotwin.light.radiosity import Radiosity
 from endotwin.pixels.samples import Samples, Views
-from endotwin.run.ahead import ahead
-from endotwin.run.threads import THREADS
+from endotwin.run.ahead import on_all_cores
 from endotwin.surface import Surface
 from endotwin.surface.casting import Caster
 from endotwin.surface.vectors import unit
@@ -66,7 +65,7 @@ def _guided(samples: Samples, surface: Surface, caster: Caster, effects: Effects
         visible = _visible(part, caster, guides_mm) if "shadows" in effects else None
         return guided(part.points_mm, part.normals(surface), guides_mm, effects.profile, visible)
 
-    parts = list(ahead(one, samples.chunks(CHUNK), THREADS)) or [one(samples)]
+    parts = list(on_all_cores(one, samples.chunks(CHUNK))) or [one(samples)]
     rows = {name: [getattr(part, name).T for part in parts] for name in Guided.__dataclass_fields__}
     return Guided(**{name: torch.cat(each, dim=1).T for name, each in rows.items()})
 
@@ -264,14 +263,17 @@ def regained(samples: Samples, material: Tensor, shared: Globals, effects: Effec
     Args:
         material: [N, 4] of the samples. width: of the robust loss, in display values.
     """
-    gain = effects["gain"]
-    predicted, slope = slope_by_log_exposure(samples, material, shared)
-    residual = Residual.of(samples, predicted, width)
-    frame = samples.views.row(samples.frame)
-    pull, normal = (
-        np.bincount(frame, (residual.weight * slope * other).sum(dim=1).numpy(), len(gain.frames))
-        for other in (residual.error, slope)
-    )
+    count = len(effects["gain"].frames)
+
+    def one(rows: slice) -> np.ndarray:
+        part = samples[rows]
+        predicted, slope = slope_by_log_exposure(part, material[rows], shared)
+        residual, frame = Residual.of(part, predicted, width), part.views.row(part.frame)
+        terms = [(residual.weight * slope * other).sum(dim=1) for other in (residual.error, slope)]
+        return np.stack([np.bincount(frame, each.numpy(), count) for each in terms])
+
+    chunks = [slice(start, start + CHUNK) for start in range(0, len(samples), CHUNK)]
+    pull, normal = sum(on_all_cores(one, chunks), np.zeros((2, count)))
     return _brightened(effects, pull / np.maximum(normal, 1e-12))
 
 

@@ -18,12 +18,13 @@ from endotwin.fit.frame_gains import FrameBorder, FramePattern, FrameSums
 from endotwin.fit.model import Globals, at_pixels, linearise
 from endotwin.pixels.samples import Samples
 from endotwin.pixels.start import DIFFUSE_SIN2
+from endotwin.run.ahead import on_all_cores
 
 CHANNELS = 4
 """Base colour red, green, blue; roughness."""
 
 CORNER_PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
-CHUNK = 1 << 18
+CHUNK = 1 << 16
 CLIPPED = 255
 
 
@@ -169,6 +170,71 @@ def add_products(sums: np.ndarray, ids: np.ndarray, left: np.ndarray, right: np.
     sums[ids[first]] += (by_id.T @ right).reshape(-1, *sums.shape[1:])
 
 
+@dataclass(frozen=True)
+class _Products:
+    """What N samples add to the normal equations.
+
+    Attributes:
+        corner: barycentric [N, 3]. materials: weighted products of the slopes by the materials: of each
+            colour with itself, and with roughness, and of roughness with itself, [N, 7]. channels: of the
+            slopes by the materials with error and slopes by the G shared parameters, [N, C·(1 + G)]. by_gain:
+            what ``FrameSums.add`` takes, if gains are eliminated. normal, right: of the shared parameters
+            alone, float64 [G, G] and [G].
+    """
+
+    corner: Tensor
+    materials: Tensor
+    channels: Tensor
+    by_gain: tuple[Tensor, Tensor, Tensor] | None
+    normal: np.ndarray
+    right: np.ndarray
+
+    @classmethod
+    def of(
+        cls,
+        samples: Samples,
+        triangles: Tensor,
+        materials: Tensor,
+        shared: Globals,
+        width: float,
+        globals_count: int,
+        gains: bool,
+    ) -> _Products:
+        """Linearised as ``assemble`` says, which has the same arguments; G is the ``globals_count``."""
+        model = linearise(samples, at_pixels(samples, triangles, materials), shared)
+        residual = Residual.of(samples, model.predicted, width)
+        by_roughness = model.by_roughness
+        if samples.bounce is not None:
+            by_roughness = torch.where(samples.sin2[:, None] < DIFFUSE_SIN2, by_roughness, 0)
+        weighted_color = residual.weight * model.by_color
+        weighted_roughness = residual.weight * by_roughness
+        products = [weighted_color[:, c] * model.by_color[:, c] for c in range(3)]
+        products += [weighted_color[:, c] * by_roughness[:, c] for c in range(3)]
+        products.append((weighted_roughness * by_roughness).sum(dim=1))
+        slopes = model.by_globals[..., :globals_count]
+        against = torch.cat([residual.error[..., None], slopes], dim=2)
+        by_color = weighted_color[..., None] * against
+        by_all = (weighted_roughness[..., None] * against).sum(dim=1, keepdim=True)
+        by_gain = None
+        if gains:
+            slope = shared.gamma * model.by_globals[..., :1]
+            pulled = residual.weight * slope[..., 0]
+            too = torch.cat(
+                [pulled * model.by_color, (pulled * by_roughness).sum(dim=1, keepdim=True)], dim=1
+            )
+            by_gain = pulled, too, torch.cat([slope, against], dim=2)
+        slopes = slopes.flatten(0, 1)
+        weighted = (slopes * residual.weight.reshape(-1, 1)).T
+        return cls(
+            corner=samples.barycentric,
+            materials=torch.stack(products, dim=1),
+            channels=torch.cat([by_color, by_all], dim=1).flatten(1),
+            by_gain=by_gain,
+            normal=(weighted @ slopes).double().cpu().numpy(),
+            right=(weighted @ residual.error.reshape(-1)).double().cpu().numpy(),
+        )
+
+
 def assemble(
     samples: Samples,
     pattern: MeshPattern,
@@ -192,42 +258,19 @@ def assemble(
     every_id = torch.from_numpy(pattern.compact).to(device)
     sums = None if frames is None else FrameSums(frames, CHANNELS, globals_count)
     normal, right = np.zeros((globals_count,) * 2), np.zeros(globals_count)
-    for start, part in zip(range(0, len(samples), CHUNK), samples.chunks(CHUNK), strict=True):
-        model = linearise(part, at_pixels(part, triangles, materials), shared)
-        residual = Residual.of(part, model.predicted, width)
-        ids, corner = every_id[start : start + len(part)], part.barycentric
-        by_roughness = model.by_roughness
-        if part.bounce is not None:
-            by_roughness = torch.where(part.sin2[:, None] < DIFFUSE_SIN2, by_roughness, 0)
-        weighted_color = residual.weight * model.by_color
-        weighted_roughness = residual.weight * by_roughness
-        products = [weighted_color[:, c] * model.by_color[:, c] for c in range(3)]
-        products += [weighted_color[:, c] * by_roughness[:, c] for c in range(3)]
-        products.append((weighted_roughness * by_roughness).sum(dim=1))
-        _add(pair_sums, ids, pairs_of(corner), torch.stack(products, dim=1))
-        slopes = model.by_globals[..., :globals_count]
-        against = torch.cat([residual.error[..., None], slopes], dim=2)
-        channels = torch.cat(
-            [
-                weighted_color[..., None] * against,
-                (weighted_roughness[..., None] * against).sum(dim=1, keepdim=True),
-            ],
-            dim=1,
-        ).flatten(1)
-        _add(corner_sums, ids, corner, channels)
+
+    def one(part: Samples) -> _Products:
+        return _Products.of(part, triangles, materials, shared, width, globals_count, frames is not None)
+
+    parts = (map if device.type != "cpu" else on_all_cores)(one, samples.chunks(CHUNK))
+    for start, part in zip(range(0, len(samples), CHUNK), parts, strict=True):
+        rows = slice(start, start + len(part.corner))
+        _add(pair_sums, every_id[rows], pairs_of(part.corner), part.materials)
+        _add(corner_sums, every_id[rows], part.corner, part.channels)
         if sums is not None:
-            by_gain = shared.gamma * model.by_globals[..., :1]
-            pulled = (residual.weight * by_gain[..., 0])[..., None]
-            materials_too = torch.cat(
-                [pulled[..., 0] * model.by_color, (pulled[..., 0] * by_roughness).sum(dim=1, keepdim=True)],
-                dim=1,
-            )
-            others = torch.cat([by_gain, against], dim=2)
-            sums.add(slice(start, start + len(part)), corner, pulled[..., 0], materials_too, others)
-        slopes = slopes.flatten(0, 1)
-        weighted = (slopes * residual.weight.reshape(-1, 1)).T
-        normal += (weighted @ slopes).double().cpu().numpy()
-        right += (weighted @ residual.error.reshape(-1)).double().cpu().numpy()
+            sums.add(rows, part.corner, *part.by_gain)
+        normal += part.normal
+        right += part.right
     vertex = pattern.vector(corner_sums.cpu().numpy()).astype(np.float32)
     pair_sums = pair_sums.cpu().numpy()
     matrices = [pattern.matrix(pair_sums[:, :, k]).to(device) for k in range(7)]

@@ -21,6 +21,7 @@ from endotwin.fit.state import State
 from endotwin.light.guides import guided
 from endotwin.light.incidence import COS_MIN
 from endotwin.pixels.samples import Samples
+from endotwin.run.ahead import on_all_cores
 from endotwin.surface.vectors import dot, unit
 
 SPREAD_DEG = 0.5
@@ -93,16 +94,21 @@ class Tilter:
         samples, pattern = self.solver.samples, self.solver.pattern
         count = len(pattern.corners)
         sums, right = np.zeros((count, 6, 6), np.float32), np.zeros((count, 3, 3), np.float32)
-        for start, part in zip(range(0, len(samples), CHUNK), samples.chunks(CHUNK), strict=True):
+
+        def one(part: Samples) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
             axis, slope, residual = self._slopes(part, normals, HUBER * noise)
             certain = residual.weight / (1 + (slope * (between / noise)) ** 2)
             weight = (certain * slope * slope).sum(dim=1).numpy()
             pull = (certain * slope * residual.error).sum(dim=1).numpy()
-            ids = pattern.compact[start : start + len(part)]
-            corner = part.barycentric.numpy()
             along = np.stack([weight * axis[:, i] * axis[:, j] for i, j in AXIS_PAIRS], axis=1)
+            return part.barycentric.numpy(), along, pull[:, None] * axis
+
+        start = 0
+        for corner, along, pulled in on_all_cores(one, samples.chunks(CHUNK)):
+            ids = pattern.compact[start : start + len(corner)]
             add_products(sums, ids, pairs_of(corner), along)
-            add_products(right, ids, corner, pull[:, None] * axis)
+            add_products(right, ids, corner, pulled)
+            start += len(corner)
         return sums, right
 
     def _slopes(

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from endotwin.light.forward import Lobes
 from endotwin.light.radiosity import Radiosity
+from endotwin.run.ahead import on_all_cores
 from endotwin.surface.rows import Rows
 
 LIGHT_STEP = 0.05
@@ -214,16 +215,18 @@ class BouncedLight:
         arriving, leaving = self.between(n, q, albedo.scaled(log_scale))
         irradiance = np.maximum(places.of(arriving), DARKEST)
         here = np.log(irradiance)
-        moved = (
+        moved = [
             (n + LIGHT_STEP, q, log_scale),
             (n, q + LIGHT_STEP, log_scale),
             (n, q, log_scale + LIGHT_STEP),
-        )
-        by_n, by_q, by_scale = ((log_irradiance(*at) - here) / LIGHT_STEP for at in moved)
+        ]
+        if seen_by is not None:
+            moved.append((n, q, log_scale, seen_by[1]))
+        changed = [found - here for found in on_all_cores(lambda at: log_irradiance(*at), moved)]
+        by_n, by_q, by_scale = (change / LIGHT_STEP for change in changed[:3])
         gamma, by_gamma = 0.0, np.zeros_like(here)
         if seen_by is not None:
-            gamma, other = seen_by
-            by_gamma = (log_irradiance(n, q, log_scale, other) - here) / GAMMA_STEP
+            gamma, by_gamma = seen_by[0], changed[3] / GAMMA_STEP
         by_n, by_q = by_n.mean(axis=1), by_q.mean(axis=1)
         level = here - (n * by_n + q * by_q)[:, None] - log_scale * by_scale - gamma * by_gamma
         columns = [
