@@ -4,6 +4,7 @@
     python benchmarks/benchmark.py DATA/colon_direct --config draft --config fine
     python benchmarks/benchmark.py DATA/colon_direct --method endopbr --budget 60s
     python benchmarks/benchmark.py DATA/colon_direct --device cuda
+    python benchmarks/benchmark.py DATA/colon_bounce --geometry true
 
 Each command runs in its own process from cold files, so that its seconds and its peak memory are its own.
 Only this script reads the truth (``truth/``: albedo and roughness of some frames; ``made.json``: the light).
@@ -15,21 +16,28 @@ import subprocess
 import sys
 import tempfile
 import time
+from dataclasses import replace
 from itertools import product
 from pathlib import Path
 
 import cv2
 import numpy as np
+from scipy.spatial import cKDTree
 
 from endotwin.evaluation.evaluation import covered_pixels
+from endotwin.fit.solve import median_edge_mm
 from endotwin.fusion._open3d import o3d
 from endotwin.render import Renderer
+from endotwin.surface import Surface
 from endotwin.twin import Twin
 
 GAMMA, FALLOFF = 1 / 2.2, 2.0
 """Truth of sequences whose made.json does not tell."""
 
 METHODS = ("twin", "endopbr")
+
+NEAR_EDGES = 2.0
+"""A vertex of the true mesh is seen as the nearest fused one is, if that is within so many of its edges."""
 
 
 def run(*arguments: object, profile: Path) -> tuple[str, float, dict]:
@@ -68,6 +76,20 @@ def material_errors(twin: Twin, truth: Path) -> tuple[float, float]:
     return float(np.sqrt(np.mean((scale * fitted - true) ** 2))), float(np.sqrt(np.mean(roughness_error**2)))
 
 
+def on_true_mesh(twin: Twin, truth: Path) -> Twin:
+    """The twin with the true mesh, all of it, for its own; seen where a fused vertex was, next to it."""
+    mesh = o3d.io.read_triangle_mesh(str(truth)).compute_vertex_normals()
+    vertices_mm, triangles, normals = map(np.asarray, (mesh.vertices, mesh.triangles, mesh.vertex_normals))
+    fused, true = twin.surface, Surface.from_mesh(vertices_mm, triangles, normals)
+    nearest = cKDTree(fused.vertices_mm + fused.origin_mm)
+    apart_mm, which = nearest.query(vertices_mm, distance_upper_bound=NEAR_EDGES * median_edge_mm(true))
+    near = np.isfinite(apart_mm)
+    which[~near] = 0
+    seen_by = np.where(near, fused.seen_by[which], 0).astype(np.int32)
+    nearest_mm = np.where(seen_by > 0, fused.nearest_mm[which], np.inf).astype(np.float32)
+    return replace(twin, surface=true.with_coverage(seen_by, nearest_mm))
+
+
 def mesh_error(twin: Twin, truth: Path) -> str:
     """Mean distance of the measured vertices from the true mesh, where there is one."""
     if not truth.exists():
@@ -101,12 +123,17 @@ def benchmark(
 ) -> dict[str, str]:
     """One row of the table."""
     twin_folder, profile = work / f"{sequence.name}-{method}-{Path(config).stem}", work / "profile.json"
-    protocol = ["--config", config, "--geometry", options.geometry]
+    geometry = "known" if options.geometry == "true" else options.geometry
+    protocol = ["--config", config, "--geometry", geometry]
     scale = [] if options.scale is None else ["--scale", options.scale]
     budget = [] if options.budget is None else ["--budget", options.budget]
     _, fuse_s, fuse = run(
         "fuse", sequence, "-o", twin_folder, "--overwrite", *protocol, *scale, profile=profile
     )
+    if options.geometry == "true":
+        on_true_mesh(Twin.load(twin_folder), sequence / "truth" / "colon.ply").save(
+            twin_folder, overwrite=True
+        )
     learn = ["--method", method, "--config", config, *budget, "--seed", options.seed]
     learn += ["--device", options.device]
     _, fit_s, fit = run("fit", twin_folder, *learn, profile=profile)
@@ -147,7 +174,7 @@ def main() -> None:
     parser.add_argument("--method", action="append", choices=METHODS, help="may be repeated (default: twin)")
     parser.add_argument("--config", action="append", help="may be repeated (default: standard)")
     parser.add_argument("--budget", help="time of each fit, as 60s or 10m (default: the config's)")
-    parser.add_argument("--geometry", default="known", choices=("known", "heldout"))
+    parser.add_argument("--geometry", default="known", choices=("known", "heldout", "true"))
     parser.add_argument("--scale", type=float, help="factor on the image size (default: the config's)")
     parser.add_argument("--device", default="cpu", choices=("cpu", "cuda"), help="that fits (default: cpu)")
     parser.add_argument("--seed", type=int, default=0)

@@ -5,6 +5,7 @@ import threading
 import pytest
 import torch
 
+from endotwin.run.ahead import on_all_cores
 from endotwin.run.together import together
 
 
@@ -53,3 +54,10 @@ def test_jobs_that_are_not_alone_keep_to_one_core_each_and_the_caller_gets_its_t
         assert torch.get_num_threads() == 3
     finally:
         torch.set_num_threads(before)
+
+
+def test_what_is_made_on_all_cores_comes_in_order_each_on_one():
+    before = torch.get_num_threads()
+    made = list(on_all_cores(lambda item: (item, torch.get_num_threads()), range(40)))
+    assert made == [(item, 1) for item in range(40)]
+    assert torch.get_num_threads() == before

@@ -190,6 +190,7 @@ class _Experiment:
             "rendered": RENDERED.vary,
             "frames": self.plan.frames,
             "steps": self.steps,
+            "batch": self.batch,
             "loss": self.plan.loss,
         }
         done = self.out / STUDY
