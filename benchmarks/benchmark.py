@@ -131,16 +131,15 @@ def benchmark(
         "fuse", sequence, "-o", twin_folder, "--overwrite", *protocol, *scale, profile=profile
     )
     if options.geometry == "true":
-        on_true_mesh(Twin.load(twin_folder), sequence / "truth" / "colon.ply").save(
-            twin_folder, overwrite=True
-        )
+        true = on_true_mesh(Twin.load(twin_folder), sequence / "truth" / "colon.ply")
+        true.save(twin_folder, overwrite=True)
     learn = ["--method", method, "--config", config, *budget, "--seed", options.seed]
     learn += ["--device", options.device]
     _, fit_s, fit = run("fit", twin_folder, *learn, profile=profile)
     printed, eval_s, _ = run("eval", twin_folder, "--json", "--scale", 1, profile=profile)
     scores, twin = json.loads(printed), Twin.load(twin_folder)
     albedo, roughness = material_errors(twin, sequence / "truth")
-    true = true_light(json.loads((sequence / "truth" / "made.json").read_text()))
+    truth = true_light(json.loads((sequence / "truth" / "made.json").read_text()))
     named = [method, config if method == "twin" else None, options.budget]
     named.append(None if options.device == "cpu" else options.device)
     return {
@@ -157,9 +156,9 @@ def benchmark(
         "SSIM": f"{scores['ssim']:.4f}",
         "PSNR covered": f"{scores['psnr_covered']:.2f} dB",
         "covered": f"{100 * scores['covered']:.1f} %",
-        "γ": percent(scores["gamma"], true["gamma"]),
-        "n": percent(scores["light"]["n"], true["n"]),
-        "q": percent(scores["light"]["q"], true["q"]),
+        "γ": percent(scores["gamma"], truth["gamma"]),
+        "n": percent(scores["light"]["n"], truth["n"]),
+        "q": percent(scores["light"]["q"], truth["q"]),
         "albedo RMSE": "-" if np.isnan(albedo) else f"{albedo:.4f}",
         "roughness RMSE": "-" if np.isnan(roughness) else f"{roughness:.4f}",
         "mesh": mesh_error(twin, sequence / "truth" / "colon.ply"),

@@ -219,10 +219,9 @@ class _Products:
         if gains:
             slope = shared.gamma * model.by_globals[..., :1]
             pulled = residual.weight * slope[..., 0]
-            too = torch.cat(
-                [pulled * model.by_color, (pulled * by_roughness).sum(dim=1, keepdim=True)], dim=1
-            )
-            by_gain = pulled, too, torch.cat([slope, against], dim=2)
+            roughness = (pulled * by_roughness).sum(dim=1, keepdim=True)
+            coupled = torch.cat([pulled * model.by_color, roughness], dim=1)
+            by_gain = pulled, coupled, torch.cat([slope, against], dim=2)
         slopes = slopes.flatten(0, 1)
         weighted = (slopes * residual.weight.reshape(-1, 1)).T
         return cls(
