@@ -87,7 +87,7 @@ def test_a_stopped_study_goes_on_to_the_same_numbers_and_more_parts_go_on_from_t
     assert (code, out) == (130, "") and "the same command goes on" in err and err.count("\n") == 1
     assert not (tmp_path / "parted").exists()
     results = set((tmp_path / "parted.partial" / "results").iterdir())
-    assert 1 <= len(results) <= 3
+    assert 2 <= len(results) <= 3  # the third may have done its last step by then
     trained = []
 
     def watch(self, label, done, total):

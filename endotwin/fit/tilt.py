@@ -103,12 +103,11 @@ class Tilter:
             along = np.stack([weight * axis[:, i] * axis[:, j] for i, j in AXIS_PAIRS], axis=1)
             return part.barycentric.numpy(), along, pull[:, None] * axis
 
-        start = 0
-        for corner, along, pulled in on_all_cores(one, samples.chunks(CHUNK)):
+        parts = on_all_cores(one, samples.chunks(CHUNK))
+        for start, (corner, along, pulled) in zip(range(0, len(samples), CHUNK), parts, strict=True):
             ids = pattern.compact[start : start + len(corner)]
             add_products(sums, ids, pairs_of(corner), along)
             add_products(right, ids, corner, pulled)
-            start += len(corner)
         return sums, right
 
     def _slopes(

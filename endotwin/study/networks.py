@@ -44,13 +44,10 @@ def network(name: str, seed: int, adapted: bool = True) -> nn.Module:
     Args:
         adapted: whether it will be trained.
     """
-    if name == "small":
-        with _drawing:
-            torch.manual_seed(seed)
-            return Small()
-    if Path(name).exists() and not (Path(name) / "config.json").is_file():
+    if name != "small" and Path(name).exists() and not (Path(name) / "config.json").is_file():
         raise OptionError(
             f"{name} has no config.json; give a folder with weights of Depth Anything, or small"
         )
-    torch.manual_seed(seed)
-    return DepthAnything(name, adapted)
+    with _drawing:
+        torch.manual_seed(seed)
+        return Small() if name == "small" else DepthAnything(name, adapted)

@@ -96,6 +96,7 @@ def study_depth(
     """Train depth networks on real frames, on frames rendered from twins, and on both; judge them on others.
 
     Until all is done what is found lies in ``out.partial``, and the same call goes on from there.
+    Frames are rendered in processes: a script that calls this needs ``if __name__ == "__main__":``.
 
     Args:
         real: sequences, all of whose frames are trained on.
@@ -159,9 +160,9 @@ class _Experiment:
 
     def run(self) -> report.Findings:
         self._enter()
-        tests = enumerate(self.tests)
-        self._tested = [self._sequences(f"test-{number}", [test], self.size) for number, test in tests]
         try:
+            tests = enumerate(self.tests)
+            self._tested = [self._sequences(f"test-{number}", [test], self.size) for number, test in tests]
             self._train_all()
             if self.network != "small":
                 self._zero_shot()
