@@ -52,7 +52,7 @@ def depth(
         str,
         typer.Option(
             metavar="small|auto|FOLDER",
-            help="A small U-Net; a folder with weights of Depth Anything V2; or those in the cache of "
+            help="A small network; a folder with weights of Depth Anything V2; or those in the cache of "
             "Hugging Face if there are any.",
         ),
     ] = "auto",
