@@ -93,41 +93,30 @@ def fit_twin(
         start = closed_form(samples[pixels.start], surface.triangles, len(surface.vertices_mm))
     if start.undetermined:
         logger.warning("the photos cannot tell %s: kept at the prior", " and ".join(start.undetermined))
-    caster = caster.threaded(THREADS)
-    lighted = _find_light(pixels, twin, caster, start, pace, states, device)
-    began = stopwatch.total
-    if lighted.found.toned is not None:
-        lighted = _find_light(pixels, twin, caster, start, pace, states, device, lighted)
-    again_s = stopwatch.total - began
-    relighting, samples, state = lighted.relighting, lighted.samples, lighted.found.state
+    fit = _Fit(twin, caster.threaded(THREADS), pace, states, device)
+    lighted = fit.light(pixels, start)
+    relighting = lighted.relighting
     with stopwatch.stage("detail"):
-        samples = relighting.guided(samples)
-        state, normals, remains = _find_detail(
-            samples, twin, state, lighted.found.cost, pace, relighting, device
-        )
+        samples = relighting.guided(lighted.samples)
+        state, normals, remains = fit.detail(lighted, samples)
         twin = replace(twin, surface=replace(surface, normals=normals))
-    wet, beyond, why = _beyond(Model(twin, state, relighting, caster), samples, states, pace)
-    odd = unusual(state.shared)
-    if odd:
+    wet, beyond, why = fit.beyond(Model(twin, state, relighting, fit.caster), samples)
+    if odd := unusual(state.shared):
         logger.warning(
             "the fit ended at %s, as it does on wrong poses, depth or photos, or without an effect that they "
             "show: do not trust it; 'endotwin check %s' looks for the cause",
             *(" and ".join(odd), twin.source.path),
         )
     with stopwatch.stage("price"):
-        decisions = {**lighted.decided.decisions, **lighted.found.decisions, **why}
-        if state.shared.tone is not None:
-            tone = decisions["tone"]
-            decisions["tone"] = replace(tone, fit_s=round(tone.fit_s + again_s, 3))
-        if "interreflection" in lighted.decided.effects and not relighting.bounces:
-            decisions["interreflection"] = _without_bounce(decisions["interreflection"])
+        decisions = lighted.decisions | why
         if remains is not None:
             _warn(remains, twin, decisions)
         effects = relighting.effects
         for effect in beyond:
             effects = effects.including(effect)
-        fitted = price(_fitted(twin, wet.model.state, effects, decisions, wet.film), caster, samples.views)
-    return fitted.with_record(
+        found = _fitted(twin, wet.model.state, effects, decisions, wet.film)
+        found = price(found, fit.caster, samples.views)
+    return found.with_record(
         fit={"method": "twin", "undetermined": list(lighted.start.undetermined), **stopwatch.to_dict()}
     )
 
@@ -194,81 +183,159 @@ def _of_some_vertices(vertex: np.ndarray, count: int, generator: np.random.Gener
 @dataclass(frozen=True)
 class _Lighted:
     """The effects that are decided, where the fit started beside them, what they make of the light, the
-    training samples under it, and what is found."""
+    training samples under it, what is found, and the seconds that finding it again took."""
 
     decided: Decided
     start: Start
     relighting: Relighting
     samples: Samples
     found: FoundLight
+    again_s: float = 0.0
+
+    @property
+    def decisions(self) -> dict[str, Decision]:
+        """Of every effect of light and response."""
+        decisions = {**self.decided.decisions, **self.found.decisions}
+        if self.found.state.shared.tone is not None:
+            tone = decisions["tone"]
+            decisions["tone"] = replace(tone, fit_s=round(tone.fit_s + self.again_s, 3))
+        if "interreflection" in self.decided.effects and not self.relighting.bounces:
+            decisions["interreflection"] = _without_bounce(decisions["interreflection"])
+        return decisions
 
 
-def _find_light(
-    pixels: _Pixels,
-    twin: Twin,
-    caster: Caster,
-    start: Start,
-    pace: Pace,
-    states: Mapping[str, str],
-    device: torch.device,
-    before: _Lighted | None = None,
-) -> _Lighted:
-    """The effects that the photos show, and light, response and coarse materials beside them; without the
-    tone curve that was found ``before``, and near the guides beside which it was. ``start`` is that of photos
-    as they are."""
-    samples, surface = pixels.samples, twin.surface
-    toned, near_mm = None, None
-    if before is not None:
-        toned, near_mm = before.found.toned, before.decided.effects.guides_mm
-    shown = samples if toned is None else samples.untoned(toned[0])
+@dataclass(frozen=True)
+class _Fit:
+    """One fit of a twin, whose surface rays of the ``caster`` meet, in the time that ``pace`` gives, with
+    effects as ``states`` say; Gauss–Newton runs on ``device``."""
+
+    twin: Twin
+    caster: Caster
+    pace: Pace
+    states: Mapping[str, str]
+    device: torch.device
+
+    def light(self, pixels: _Pixels, start: Start) -> _Lighted:
+        """The effects that the photos show, and light, response and coarse materials beside them; found again
+        without a tone curve, if there is one. ``start`` is that of photos as they are."""
+        first = self._lighted(pixels, start)
+        if first.found.toned is None:
+            return first
+        began = self.pace.stopwatch.total
+        again = self._lighted(pixels, start, first)
+        return replace(again, again_s=self.pace.stopwatch.total - began)
+
+    def _lighted(self, pixels: _Pixels, start: Start, before: _Lighted | None = None) -> _Lighted:
+        """As ``light``; without the tone curve that was found ``before``, and near the guides beside which it
+        was."""
+        samples, surface = pixels.samples, self.twin.surface
+        toned, near_mm = None, None
+        if before is not None:
+            toned, near_mm = before.found.toned, before.decided.effects.guides_mm
+        shown = samples if toned is None else samples.untoned(toned[0])
+        with self.pace.stopwatch.stage("effects"):
+
+            def glints() -> Glints:
+                return Glints.of(shown[pixels.smooth], surface, start)
+
+            late, telling = self.pace.light_is_over, shown[pixels.telling]
+            decided = decide(telling, self.twin, self.caster, glints, self.states, late, near_mm or AT_LENS)
+            start = _start_beside(decided, shown[pixels.start], surface, start, toned is not None)
+            faint = NOTHING
+            if not start.undetermined:
+                faint = Faint.beside(decided.effects, self.states, shown[pixels.light], surface)
+            relighting = Relighting(surface, self.caster, decided.effects, samples.views, faint)
+            samples = lit(samples, surface, self.caster, relighting.effects)
+        with self.pace.stopwatch.stage("light"):
+            wanted = {name: self.states.get(name, "auto") for name in ("coat", "tone")}
+            if "specular" not in decided.effects:
+                wanted["coat"] = "off"
+            parts = samples[pixels.light], samples[pixels.white]
+            stage = LightStage(*parts, surface, start, self.pace, relighting, wanted, self.device, toned)
+            return _Lighted(decided, start, relighting, samples, stage.found())
+
+    def detail(self, lighted: _Lighted, samples: Samples) -> tuple[State, np.ndarray, Remains | None]:
+        """The state with finer features on top, normals [V, 3] tilted as the photos show, and what is left of
+        the photos (None without time for detail); light, response and the coarse features stay."""
+        surface, pace, relighting = self.twin.surface, self.pace, lighted.relighting
+        coarse, normals = lighted.found.state, surface.normals
+        at_vertices = coarse.mean + coarse.operator.at(surface.vertices_mm, coarse.table)
+        finer = self._finer(samples, lighted.found.cost)
+        if finer is None:
+            return State(None, at_vertices, None, coarse.shared), normals, None
+        operator, samples = finer
+        state = State(operator, at_vertices, torch.zeros(operator.forward_csr.shape[1], 4), coarse.shared)
+        unit, mesh = unit_mm(surface), surface.triangles
+        solver = GaussNewton(samples, mesh, operator, unit, 0, pace.out_of_time, self.device)
+        step_s = 0.0
+        for number in range(pace.plan.steps):
+            if pace.left(ITERATIONS) <= step_s / 2:
+                break
+            before = pace.stopwatch.total
+            relighting(solver, state)
+            state = solver.step(state, joint=False).state
+            step_s = pace.stopwatch.total - before
+            pace.report("find the detail", number + 1, pace.plan.steps)
+        tilter = Tilter(solver, state, relighting.effects)
+        for number in range(pace.plan.tilts):
+            if pace.left(ITERATIONS) <= step_s / 2:
+                break
+            normals = tilter.tilted(normals)
+            pace.report("tilt the normals", number + 1, pace.plan.tilts)
+        return state, normals, Remains.of(solver.noise(state), *solver.tried(state))
+
+    def _finer(self, samples: Samples, cost: Cost) -> tuple[HashOperator, Samples] | None:
+        """Features as fine as the mesh, since finer ones would say nothing that a vertex can hold, and the
+        samples that there is time for; None where there is none for either.
+
+        Where there is no time for hash features, each vertex has a value of its own: those lack only what
+        vertices learn from others.
+        """
+        surface, pace = self.twin.surface, self.pace
+        finest_mm = pace.plan.detail * median_edge_mm(surface)
+        coarsest_mm = unit_mm(surface) * DETAIL_COARSEST_MM
+        grid = HashGrid(coarsest_mm, finest_mm, DETAIL_GROWTH)
+        setup_s = cost.setup_s * len(surface.vertices_mm) * len(grid.cells_mm) / cost.weights
+        left_s = pace.left(ITERATIONS)
+        if finest_mm > coarsest_mm or not pace.plan.steps or left_s <= cost.step_s / 2:
+            return None
+        if np.isfinite(left_s):
+            assembly_s = ASSEMBLY * (left_s - setup_s if left_s > 2 * setup_s else left_s)
+            count = int(cost.pixels * assembly_s / cost.step_s)
+            samples = samples.thinned(count, np.random.default_rng(len(samples)))
+        if left_s > 2 * setup_s:
+            return HashOperator.of(surface.vertices_mm, grid), samples
+        return HashOperator.each(len(surface.vertices_mm), finest_mm), samples
+
+    def beyond(self, model: Model, samples: Samples) -> tuple[Found, list[Effect], dict[str, Decision]]:
+        """What highlights show beyond the model, as far as there is time: the film, effects that are on, and
+        why each is on or off."""
+        hurried = Decision("off", "no time to judge")
+        wet, glitter, glare = Found(hurried, model), (None, hurried), (None, hurried)
+        pace, specular = self.pace, "specular" in model.relighting.effects
+        film, sparkles, glares = (
+            self.states.get(name, "auto") if specular else "off" for name in ("film", "sparkle", "bloom")
+        )
+        with pace.stopwatch.stage("film"):
+            if not pace.out_of_time():
+                wet = model.film(samples, film, pace.report)
+        with pace.stopwatch.stage("sparkle"):
+            if not pace.out_of_time():
+                glitter = sparkle(wet, samples.views, sparkles, pace.report)
+        with pace.stopwatch.stage("bloom"):
+            if not pace.out_of_time():
+                glare = bloom(wet, samples, glares, pace.report)
+        found = [each for each in (wet.effect, glitter[0], glare[0]) if each is not None]
+        return wet, found, {"film": wet.decision, "sparkle": glitter[1], "bloom": glare[1]}
+
+
+def _start_beside(decided: Decided, shown: Samples, surface: Surface, start: Start, toned: bool) -> Start:
+    """Where the fit starts beside the effects that are ``decided``: at ``start``, unless these say otherwise,
+    or what is ``shown`` had a tone curve over it."""
     mesh = surface.triangles, len(surface.vertices_mm)
-    with pace.stopwatch.stage("effects"):
-
-        def glints() -> Glints:
-            return Glints.of(shown[pixels.smooth], surface, start)
-
-        late, telling = pace.light_is_over, shown[pixels.telling]
-        decided = decide(telling, twin, caster, glints, states, late, near_mm or AT_LENS)
-        if decided.light is not None:
-            start = start_at(shown[pixels.start], *mesh, decided.light, decided.gamma)
-        elif toned is not None:
-            start = closed_form(shown[pixels.start], *mesh)
-        faint = NOTHING
-        if not start.undetermined:
-            faint = Faint.beside(decided.effects, states, shown[pixels.light], surface)
-        relighting = Relighting(surface, caster, decided.effects, samples.views, faint)
-        samples = lit(samples, surface, caster, relighting.effects)
-    with pace.stopwatch.stage("light"):
-        wanted = {name: states.get(name, "auto") for name in ("coat", "tone")}
-        if "specular" not in decided.effects:
-            wanted["coat"] = "off"
-        parts = samples[pixels.light], samples[pixels.white]
-        stage = LightStage(*parts, surface, start, pace, relighting, wanted, device, toned)
-        return _Lighted(decided, start, relighting, samples, stage.found())
-
-
-def _beyond(
-    model: Model, samples: Samples, states: Mapping[str, str], pace: Pace
-) -> tuple[Found, list[Effect], dict[str, Decision]]:
-    """What highlights show beyond the model, as far as there is time: the film, effects that are on, and why
-    each is on or off."""
-    hurried = Decision("off", "no time to judge")
-    wet, glitter, glare = Found(hurried, model), (None, hurried), (None, hurried)
-    specular = "specular" in model.relighting.effects
-    film, sparkles, glares = (
-        states.get(name, "auto") if specular else "off" for name in ("film", "sparkle", "bloom")
-    )
-    with pace.stopwatch.stage("film"):
-        if not pace.out_of_time():
-            wet = model.film(samples, film, pace.report)
-    with pace.stopwatch.stage("sparkle"):
-        if not pace.out_of_time():
-            glitter = sparkle(wet, samples.views, sparkles, pace.report)
-    with pace.stopwatch.stage("bloom"):
-        if not pace.out_of_time():
-            glare = bloom(wet, samples, glares, pace.report)
-    found = [each for each in (wet.effect, glitter[0], glare[0]) if each is not None]
-    return wet, found, {"film": wet.decision, "sparkle": glitter[1], "bloom": glare[1]}
+    if decided.light is not None:
+        return start_at(shown, *mesh, decided.light, decided.gamma)
+    return closed_form(shown, *mesh) if toned else start
 
 
 def _without_bounce(decision: Decision) -> Decision:
@@ -279,59 +346,6 @@ def _smooth(samples: Samples, surface: Surface) -> np.ndarray:
     """Bool [N]: samples off the creases of the surface."""
     smooth = surface.normal_agreement() > np.cos(np.radians(CERTAIN_NORMAL_DEG))
     return smooth[samples.triangle.numpy()]
-
-
-def _find_detail(
-    samples: Samples,
-    twin: Twin,
-    state: State,
-    cost: Cost,
-    pace: Pace,
-    relighting: Relighting,
-    device: torch.device,
-) -> tuple[State, np.ndarray, Remains | None]:
-    """The state with finer features on top, normals [V, 3] tilted as the photos show, and what is left of the
-    photos (None without time for detail); light, response and the coarse features stay.
-
-    They are as fine as the mesh: finer ones would say nothing that a vertex can hold. Where there is no time
-    for hash features, each vertex has a value of its own: those lack only what vertices learn from others.
-    """
-    surface = twin.surface
-    unit, normals = unit_mm(surface), surface.normals
-    at_vertices = state.mean + state.operator.at(surface.vertices_mm, state.table)
-    state = State(None, at_vertices, None, state.shared)
-    finest_mm, coarsest_mm = pace.plan.detail * median_edge_mm(surface), unit * DETAIL_COARSEST_MM
-    grid = HashGrid(coarsest_mm, finest_mm, DETAIL_GROWTH)
-    setup_s = cost.setup_s * len(surface.vertices_mm) * len(grid.cells_mm) / cost.weights
-    left_s = pace.left(ITERATIONS)
-    if finest_mm > coarsest_mm or not pace.plan.steps or left_s <= cost.step_s / 2:
-        return state, normals, None
-    if np.isfinite(left_s):
-        assembly_s = ASSEMBLY * (left_s - setup_s if left_s > 2 * setup_s else left_s)
-        count = int(cost.pixels * assembly_s / cost.step_s)
-        samples = samples.thinned(count, np.random.default_rng(len(samples)))
-    if left_s > 2 * setup_s:
-        operator = HashOperator.of(surface.vertices_mm, grid)
-    else:
-        operator = HashOperator.each(len(surface.vertices_mm), finest_mm)
-    state = State(operator, at_vertices, torch.zeros(operator.forward_csr.shape[1], 4), state.shared)
-    solver = GaussNewton(samples, surface.triangles, operator, unit, 0, pace.out_of_time, device)
-    step_s = 0.0
-    for number in range(pace.plan.steps):
-        if pace.left(ITERATIONS) <= step_s / 2:
-            break
-        before = pace.stopwatch.total
-        relighting(solver, state)
-        state = solver.step(state, joint=False).state
-        step_s = pace.stopwatch.total - before
-        pace.report("find the detail", number + 1, pace.plan.steps)
-    tilter = Tilter(solver, state, relighting.effects)
-    for number in range(pace.plan.tilts):
-        if pace.left(ITERATIONS) <= step_s / 2:
-            break
-        normals = tilter.tilted(normals)
-        pace.report("tilt the normals", number + 1, pace.plan.tilts)
-    return state, normals, Remains.of(solver.noise(state), *solver.tried(state))
 
 
 def median_edge_mm(surface: Surface) -> float:
