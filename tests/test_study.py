@@ -187,14 +187,30 @@ def test_what_cannot_be_learned_from_or_judged_by_is_refused_before_any_training
     assert [entry.name for entry in tmp_path.iterdir()] == ["spoilt"]
 
 
-def test_a_study_does_not_go_on_from_frames_that_were_changed(made, other, tmp_path, monkeypatch):
+@pytest.fixture
+def stopped(made, other, tmp_path, monkeypatch):
+    """A study that was stopped as it began to train; going on with it."""
+
     def stop(*_):
         raise KeyboardInterrupt
+
+    def go_on():
+        study_depth([made / "tube"], [made / "twin"], [other], tmp_path / "s", Plan(network="small"))
 
     with monkeypatch.context() as patch:
         patch.setattr("endotwin.study.run.train", stop)
         with pytest.raises(KeyboardInterrupt):
-            study_depth([made / "tube"], [made / "twin"], [other], tmp_path / "s", Plan(network="small"))
+            go_on()
+    return go_on
+
+
+def test_a_study_does_not_go_on_with_a_network_of_other_widths(stopped, monkeypatch):
+    monkeypatch.setattr("endotwin.study.small.WIDTHS", (16, 24, 48, 96, 192))
+    with pytest.raises(OutputError, match="another study or network"):
+        stopped()
+
+
+def test_a_study_does_not_go_on_from_frames_that_were_changed(stopped, other, tmp_path):
     changed = tmp_path / "changed"
     shutil.copytree(other, changed)
     blacken(changed / "0001_depth.tiff")
@@ -202,7 +218,7 @@ def test_a_study_does_not_go_on_from_frames_that_were_changed(made, other, tmp_p
     changed.rename(other)
     try:
         with pytest.raises(OutputError, match="of other frames; delete it"):
-            study_depth([made / "tube"], [made / "twin"], [other], tmp_path / "s", Plan(network="small"))
+            stopped()
     finally:
         shutil.rmtree(other)
         (tmp_path / "kept").rename(other)

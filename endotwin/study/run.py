@@ -188,6 +188,7 @@ class _Experiment:
             "tests": [str(sequence.path.resolve()) for sequence in self.tests],
             "checksums": self.sums,
             "network": self.network,
+            "parameters": self.parameters,
             "rendered": RENDERED.vary,
             "frames": self.plan.frames,
             "steps": self.steps,
@@ -196,7 +197,7 @@ class _Experiment:
         }
         done = self.out / STUDY
         if (
-            not goes_on(self.work, STUDY, asked, "another study, or of other frames")
+            not goes_on(self.work, STUDY, asked, "another study or network, or of other frames")
             and done.exists()
             and _read(done) == asked
         ):
