@@ -114,9 +114,9 @@ def fit_twin(
         effects = relighting.effects
         for effect in beyond:
             effects = effects.including(effect)
-        found = _fitted(twin, wet.model.state, effects, decisions, wet.film)
-        found = price(found, fit.caster, samples.views)
-    return found.with_record(
+        fitted = _fitted(twin, wet.model.state, effects, decisions, wet.film)
+        priced = price(fitted, fit.caster, samples.views)
+    return priced.with_record(
         fit={"method": "twin", "undetermined": list(lighted.start.undetermined), **stopwatch.to_dict()}
     )
 
@@ -240,7 +240,8 @@ class _Fit:
 
             late, telling = self.pace.light_is_over, shown[pixels.telling]
             decided = decide(telling, self.twin, self.caster, glints, self.states, late, near_mm or AT_LENS)
-            start = _start_beside(decided, shown[pixels.start], surface, start, toned is not None)
+            if decided.light is not None or toned is not None:
+                start = _start_beside(decided, shown[pixels.start], surface)
             faint = NOTHING
             if not start.undetermined:
                 faint = Faint.beside(decided.effects, self.states, shown[pixels.light], surface)
@@ -329,13 +330,12 @@ class _Fit:
         return wet, found, {"film": wet.decision, "sparkle": glitter[1], "bloom": glare[1]}
 
 
-def _start_beside(decided: Decided, shown: Samples, surface: Surface, start: Start, toned: bool) -> Start:
-    """Where the fit starts beside the effects that are ``decided``: at ``start``, unless these say otherwise,
-    or what is ``shown`` had a tone curve over it."""
+def _start_beside(decided: Decided, shown: Samples, surface: Surface) -> Start:
+    """Where the fit starts beside the effects that are ``decided``, from what is ``shown``."""
     mesh = surface.triangles, len(surface.vertices_mm)
-    if decided.light is not None:
-        return start_at(shown, *mesh, decided.light, decided.gamma)
-    return closed_form(shown, *mesh) if toned else start
+    if decided.light is None:
+        return closed_form(shown, *mesh)
+    return start_at(shown, *mesh, decided.light, decided.gamma)
 
 
 def _without_bounce(decision: Decision) -> Decision:
