@@ -44,13 +44,21 @@ def test_the_first_error_stops_the_others_at_their_next_count(error):
     assert set(ended) >= {"goes on", "fails"}
 
 
-@pytest.mark.parametrize(("threads", "on_one"), [(1, False), (2, True)])
-def test_jobs_that_are_not_alone_keep_to_one_core_each_and_the_caller_gets_its_threads_back(threads, on_one):
-    before, seen = torch.get_num_threads(), []
+@pytest.mark.parametrize(
+    ("jobs", "at_a_time", "cores_each"),
+    [(2, 1, [3, 3]), (2, 2, [1, 1]), (3, 2, [1, 1, 2]), (1, 2, [2]), (6, 4, [1, 1, 1, 1, 2, 2])],
+)
+def test_jobs_keep_to_one_core_each_the_last_share_all_and_the_caller_gets_its_threads_back(
+    jobs, at_a_time, cores_each
+):
+    before, seen = torch.get_num_threads(), {}
     torch.set_num_threads(3)
     try:
-        together(lambda job, count: seen.append(torch.get_num_threads()), [1, 2], threads, lambda _: None)
-        assert seen == [1, 1] if on_one else seen == [3, 3]
+        together(
+            lambda job, count: seen.update({job: torch.get_num_threads()}),
+            range(jobs), at_a_time, lambda _: None,
+        )  # fmt: skip
+        assert [seen[job] for job in range(jobs)] == cores_each
         assert torch.get_num_threads() == 3
     finally:
         torch.set_num_threads(before)

@@ -8,6 +8,8 @@ from contextlib import nullcontext
 from threading import Event, Lock
 from typing import TypeVar
 
+import torch
+
 from endotwin.run.threads import one_core
 
 Job = TypeVar("Job")
@@ -19,7 +21,8 @@ def together(
     threads: int,
     progress: Callable[[int], None],
 ) -> None:
-    """``work(job, count)`` for all ``jobs``, so many at a time, each of them on one core unless it is alone.
+    """``work(job, count)`` for all ``jobs``, so many at a time on one core each; those last ones that are too
+    few for that share all cores.
 
     The first error, or Ctrl-C, stops the others at their next ``count``.
 
@@ -27,6 +30,7 @@ def together(
         work: calls ``count`` with how much of the job is done.
         progress: called with how much of all jobs is done, by one job at a time.
     """
+    last = len(jobs) % threads
     done, stopped, turn = [0] * len(jobs), Event(), Lock()
 
     def begin(number: int) -> None:
@@ -37,6 +41,8 @@ def together(
                 done[number] = amount
                 progress(sum(done))
 
+        if threads > 1:
+            torch.set_num_threads(1 if number < len(jobs) - last else threads // last)  # of this thread alone
         work(jobs[number], count)
 
     with one_core() if threads > 1 else nullcontext(), ThreadPoolExecutor(threads) as pool:

@@ -70,7 +70,7 @@ def train(
     """
     network.to(device).train()
     weights = [each for each in network.parameters() if each.requires_grad]
-    optimizer = torch.optim.Adam(weights, lr=course.rate)
+    optimizer = torch.optim.Adam(weights, lr=course.rate, fused=True)
     first = _resumed(network, optimizer, checkpoint, course)
     for step in range(first, course.steps):
         for group in optimizer.param_groups:
