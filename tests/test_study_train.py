@@ -31,16 +31,37 @@ def frames(count: int, color: int = 90, depth_mm: float = 30.0) -> Frames:
     return Frames((color + noise).astype(np.uint8), depths.astype(np.float16), np.arange(count))
 
 
+def known(depth_mm: torch.Tensor) -> torch.Tensor:
+    return torch.isfinite(depth_mm)
+
+
 def test_huber_is_quadratic_below_five_millimetres_and_linear_beyond():
     depth_mm = torch.tensor([30.0])
-    assert huber(depth_mm + 3, depth_mm).item() == pytest.approx(4.5)
-    assert huber(depth_mm - 12, depth_mm).item() == pytest.approx(HUBER_MM * (12 - HUBER_MM / 2))
+    assert huber(depth_mm + 3, depth_mm, known(depth_mm)).item() == pytest.approx(4.5)
+    far = huber(depth_mm - 12, depth_mm, known(depth_mm)).item()
+    assert far == pytest.approx(HUBER_MM * (12 - HUBER_MM / 2))
 
 
 def test_silog_of_a_common_factor_is_its_logarithm_by_root_two():
     depth_mm = torch.linspace(5, 90, 50)
-    assert silog(2 * depth_mm, depth_mm).item() == pytest.approx(math.log(2) / math.sqrt(2), rel=1e-5)
-    assert silog(depth_mm, depth_mm).item() == pytest.approx(0, abs=1e-5)
+    twice = silog(2 * depth_mm, depth_mm, known(depth_mm)).item()
+    assert twice == pytest.approx(math.log(2) / math.sqrt(2), rel=1e-5)
+    assert silog(depth_mm, depth_mm, known(depth_mm)).item() == pytest.approx(0, abs=1e-5)
+
+
+@pytest.mark.parametrize("loss", [huber, silog])
+def test_pixels_without_depth_change_neither_loss_nor_slope(loss):
+    depth_mm = torch.linspace(5, 90, 50)
+    depth_mm[::3] = torch.nan
+    has = known(depth_mm)
+    predicted_mm = torch.full((50,), 40.0, requires_grad=True)
+    some_mm = predicted_mm.detach()[has].requires_grad_()
+    whole, part = loss(predicted_mm, depth_mm, has), loss(some_mm, depth_mm[has], has[has])
+    whole.backward()
+    part.backward()
+    assert whole.item() == pytest.approx(part.item(), rel=1e-6)
+    torch.testing.assert_close(predicted_mm.grad[has], some_mm.grad)
+    assert not predicted_mm.grad[~has].any()
 
 
 def test_each_frame_of_all_pools_is_as_likely():

@@ -46,9 +46,9 @@ def test_the_first_error_stops_the_others_at_their_next_count(error):
 
 @pytest.mark.parametrize(
     ("jobs", "at_a_time", "cores_each"),
-    [(2, 1, [3, 3]), (2, 2, [1, 1]), (3, 2, [1, 1, 2]), (1, 2, [2]), (6, 4, [1, 1, 1, 1, 2, 2])],
+    [(2, 1, [3, 3]), (2, 2, [1, 1]), (3, 2, [1, 1, 3]), (1, 2, [3]), (6, 4, [1, 1, 1, 1, 1, 1])],
 )
-def test_jobs_keep_to_one_core_each_the_last_share_all_and_the_caller_gets_its_threads_back(
+def test_jobs_keep_to_one_core_each_the_last_alone_to_none_and_the_caller_gets_its_threads_back(
     jobs, at_a_time, cores_each
 ):
     before, seen = torch.get_num_threads(), {}

@@ -8,8 +8,6 @@ from contextlib import nullcontext
 from threading import Event, Lock
 from typing import TypeVar
 
-import torch
-
 from endotwin.run.threads import one_core
 
 Job = TypeVar("Job")
@@ -21,8 +19,8 @@ def together(
     threads: int,
     progress: Callable[[int], None],
 ) -> None:
-    """``work(job, count)`` for all ``jobs``, so many at a time on one core each; those last ones that are too
-    few for that share all cores.
+    """``work(job, count)`` for all ``jobs``, so many at a time on one core each; a last one that would be
+    alone follows on all cores.
 
     The first error, or Ctrl-C, stops the others at their next ``count``.
 
@@ -30,7 +28,7 @@ def together(
         work: calls ``count`` with how much of the job is done.
         progress: called with how much of all jobs is done, by one job at a time.
     """
-    last = len(jobs) % threads
+    alone = len(jobs) % threads == 1
     done, stopped, turn = [0] * len(jobs), Event(), Lock()
 
     def begin(number: int) -> None:
@@ -41,15 +39,15 @@ def together(
                 done[number] = amount
                 progress(sum(done))
 
-        if threads > 1:
-            torch.set_num_threads(1 if number < len(jobs) - last else threads // last)  # of this thread alone
         work(jobs[number], count)
 
     with one_core() if threads > 1 else nullcontext(), ThreadPoolExecutor(threads) as pool:
         try:
-            for job in as_completed([pool.submit(begin, number) for number in range(len(jobs))]):
+            for job in as_completed([pool.submit(begin, number) for number in range(len(jobs) - alone)]):
                 job.result()
         except BaseException:
             stopped.set()
             pool.shutdown(cancel_futures=True)
             raise
+    if alone:
+        begin(len(jobs) - 1)  # in this thread: torch is slower on all cores from another

@@ -21,14 +21,16 @@ SILOG_WEIGHT = 0.5
 CHECKPOINT_STEPS = 100
 
 
-def huber(predicted_mm: torch.Tensor, depth_mm: torch.Tensor) -> torch.Tensor:
-    """Mean Huber loss: quadratic below 5 mm."""
-    return functional.huber_loss(predicted_mm, depth_mm, delta=HUBER_MM)
+def huber(predicted_mm: torch.Tensor, depth_mm: torch.Tensor, has: torch.Tensor) -> torch.Tensor:
+    """Mean Huber loss of the pixels that have depth: quadratic below 5 mm."""
+    known_mm = torch.where(has, depth_mm, predicted_mm.detach())  # picking pixels takes longer than all
+    return functional.huber_loss(predicted_mm, known_mm, reduction="sum", delta=HUBER_MM) / has.sum()
 
 
-def silog(predicted_mm: torch.Tensor, depth_mm: torch.Tensor) -> torch.Tensor:
-    """√(mean g² − ½·(mean g)²), g = ln d − ln p (Eigen et al. 2014; Depth Anything V2's metric recipe)."""
-    g = depth_mm.log() - predicted_mm.clamp(min=1e-3).log()
+def silog(predicted_mm: torch.Tensor, depth_mm: torch.Tensor, has: torch.Tensor) -> torch.Tensor:
+    """√(mean g² − ½·(mean g)²), g = ln d − ln p, of the pixels that have depth (Eigen et al. 2014; Depth
+    Anything V2's metric recipe)."""
+    g = depth_mm[has].log() - predicted_mm[has].clamp(min=1e-3).log()
     return (g.square().mean() - SILOG_WEIGHT * g.mean().square() + 1e-12).sqrt()
 
 
@@ -79,7 +81,7 @@ def train(
         has = torch.isfinite(depth_mm) & (depth_mm > 0)
         if has.any():
             optimizer.zero_grad()
-            LOSSES[course.loss](network(color)[has], depth_mm[has]).backward()
+            LOSSES[course.loss](network(color), depth_mm, has).backward()
             nn.utils.clip_grad_norm_(weights, 1.0)
             optimizer.step()
         done = step + 1
@@ -127,7 +129,7 @@ def batch(pools: list[Frames], course: Course, step: int) -> tuple[torch.Tensor,
 
 def as_tensor(color: np.ndarray) -> torch.Tensor:
     """Photos uint8 [B, H, W, 3] as float32 [B, 3, H, W] in [0, 1]."""
-    return torch.from_numpy(np.ascontiguousarray(color.transpose(0, 3, 1, 2))).float() / 255
+    return torch.from_numpy(color).permute(0, 3, 1, 2).float() / 255
 
 
 def predicted(network: nn.Module, color: np.ndarray, device: torch.device) -> np.ndarray:
