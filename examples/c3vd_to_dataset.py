@@ -30,7 +30,7 @@ def main() -> None:
     print(endotwin.evaluate(twin))
     summary = endotwin.synthesize(
         twin,
-        f"jitter:frames={options.frames}",
+        f"jitter:frames={options.frames},translation=2,rotation=10",
         options.dataset,
         material=["roughness*1.3"],
         light=["intensity*0.8"],

@@ -30,7 +30,7 @@ def test_commands_spell_out_what_the_terminal_lacks_and_write_utf_8(made, comman
     assert done.stdout.isascii() and says in done.stdout.decode()
     assert done.stderr.isascii() and b"Traceback" not in done.stderr
     if command.startswith("synth"):
-        assert "turned by up to 8°" in (made / "dataset" / "dataset.json").read_text(encoding="utf-8")
+        assert "turned by up to 10°" in (made / "dataset" / "dataset.json").read_text(encoding="utf-8")
 
 
 def test_a_sequence_whose_name_is_not_utf_8_becomes_a_twin_and_a_dataset(made, tmp_path):

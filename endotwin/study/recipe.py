@@ -7,6 +7,8 @@ from pathlib import Path
 
 import yaml
 
+TRANSLATION_MM, ROTATION_DEG = 5, 8
+
 OTHER_LENSES = 1 / 5
 """Share of frames that are rendered through other lenses than the twin's own, where a recipe asks for any."""
 

@@ -38,9 +38,8 @@ from endotwin.study.arms import HEADLINE, Arm, arms
 from endotwin.study.frames import Frames, kept, lit_pixels, of_dataset, of_sequence, require_depth
 from endotwin.study.leak import require_unseen
 from endotwin.study.networks import found, network
-from endotwin.study.recipe import OTHER_LENSES, RENDERED, Recipe
+from endotwin.study.recipe import OTHER_LENSES, RENDERED, ROTATION_DEG, TRANSLATION_MM, Recipe
 from endotwin.study.train import LOSSES, Course, train
-from endotwin.synth.trajectories.trajectory import JitterOptions
 from endotwin.tradeoff.run import PARTIAL, machine
 from endotwin.twin import Twin
 
@@ -48,10 +47,6 @@ Progress = Callable[[str, int, int], None]
 
 OWN = ("study", "results", "networks", "recipes", "depth")
 """First parts of the names that a finished folder holds."""
-
-JITTER = JitterOptions()
-TRAJECTORY = f"jitter:translation={JITTER.translation:g},rotation={JITTER.rotation:g}"
-"""Poses of what is rendered: as far from the recorded ones as ``synth`` takes them by default."""
 
 SUPERSAMPLING = 2
 """Frames are rendered at so many times the network's width, and each pixel is the mean of what it covers."""
@@ -250,7 +245,7 @@ class _Experiment:
             _keep(lens.to_dict(), lens_file)
             pipeline.synthesize(
                 twin,
-                f"{TRAJECTORY},frames={count}",
+                f"jitter:frames={count},translation={TRANSLATION_MM},rotation={ROTATION_DEG}",
                 data,
                 vary=self.work / "recipes" / f"{recipe.name}.yaml",
                 camera=lens_file,
@@ -350,7 +345,7 @@ class _Experiment:
             "twins": [folder.name for folder in self.twins],
             "tests": _names(self.tests),
             "test_frames": [len(sequence) for sequence in self.tests],
-            "trajectory": TRAJECTORY,
+            "trajectory": f"jitter:translation={TRANSLATION_MM},rotation={ROTATION_DEG}",
             "unseen": self.unseen,
             "machine": machine(),
         }

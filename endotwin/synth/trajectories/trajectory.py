@@ -54,15 +54,11 @@ class Trajectory:
 
 @dataclass(frozen=True)
 class JitterOptions:
-    """Options of ``jitter:``, which moves and turns the sequence's poses at random (as Han & Wu 2025 do).
-
-    By default so far that a depth network learns more from such poses than from the recorded ones, and no
-    farther: walls that no recording looks at teach it less (docs/study.md).
-    """
+    """Options of ``jitter:``, which moves and turns the sequence's poses at random (as Han & Wu 2025 do)."""
 
     frames: int = field(default=0, metadata={"help": "number of poses; 0: as many as the sequence has"})
-    translation: float = field(default=5.0, metadata={"help": "farthest move, mm, in any direction"})
-    rotation: float = field(default=8.0, metadata={"help": "largest turn, degrees, about any axis"})
+    translation: float = field(default=2.0, metadata={"help": "farthest move, mm, in any direction"})
+    rotation: float = field(default=10.0, metadata={"help": "largest turn, degrees, about any axis"})
 
 
 KINDS = {
