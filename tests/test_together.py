@@ -40,7 +40,7 @@ def test_the_first_error_stops_the_others_at_their_next_count(error):
             ended.append(job)
 
     with pytest.raises(error, match="first"):
-        together(forever, ["goes on", "fails", "waits"], 2, lambda _: None)
+        together(forever, ["goes on", "fails", "waits", "waits too"], 2, lambda _: None)
     assert set(ended) >= {"goes on", "fails"}
 
 
@@ -48,16 +48,17 @@ def test_the_first_error_stops_the_others_at_their_next_count(error):
     ("jobs", "at_a_time", "cores_each"),
     [(2, 1, [3, 3]), (2, 2, [1, 1]), (3, 2, [1, 1, 3]), (1, 2, [3]), (6, 4, [1, 1, 1, 1, 1, 1])],
 )
-def test_jobs_keep_to_one_core_each_the_last_alone_to_none_and_the_caller_gets_its_threads_back(
+def test_jobs_keep_to_one_core_each_one_alone_has_all_and_the_caller_gets_its_threads_back(
     jobs, at_a_time, cores_each
 ):
     before, seen = torch.get_num_threads(), {}
+
+    def work(job: int, count) -> None:
+        seen[job] = torch.get_num_threads()
+
     torch.set_num_threads(3)
     try:
-        together(
-            lambda job, count: seen.update({job: torch.get_num_threads()}),
-            range(jobs), at_a_time, lambda _: None,
-        )  # fmt: skip
+        together(work, range(jobs), at_a_time, lambda _: None)
         assert [seen[job] for job in range(jobs)] == cores_each
         assert torch.get_num_threads() == 3
     finally:

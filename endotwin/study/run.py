@@ -274,7 +274,7 @@ class _Experiment:
 
     def _train_all(self) -> None:
         """Train and judge each arm with each seed that has no result yet; small networks on a CPU one a core,
-        for two on a core each see 1.5 times as many photos as one on both."""
+        for two on a core each see 1.2 times as many photos as one on both."""
         jobs = [(arm, seed) for arm in self.arms for seed in range(self.plan.seeds)]
         jobs = [job for job in jobs if not self._result(*job).exists()]
         for arm, _ in jobs:
