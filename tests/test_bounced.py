@@ -10,7 +10,7 @@ import trimesh
 from independent.gloss import Gloss
 
 from endotwin.fusion.mesh import surface_of
-from endotwin.light.bounced import GAMMA_STEP, Albedo, BouncedLight, Places
+from endotwin.light.bounced import GAMMA_STEP, BOUNCES_BY, Albedo, BouncedLight, Places
 from endotwin.light.forward import Lobes
 from endotwin.light.guides import AT_LENS, COSINE
 from endotwin.light.radiosity import Radiosity
@@ -106,6 +106,17 @@ def test_the_expansion_is_exact_where_it_was_made_and_follows_the_light(sphere):
     np.testing.assert_allclose(bounce.by_q, -np.log(RADIUS_MM), rtol=0.01)
     moved = light.at(places, 0.55, 1.95, albedo.scaled(0.15))
     np.testing.assert_allclose(bounce.irradiance(0.55, 1.95, 0.15), moved, rtol=0.01)
+
+
+def test_the_expansion_by_the_scale_alone_is_exact_there_too_and_still_in_all_else(sphere):
+    light, places, albedo = sphere
+    whole, part = (
+        light.expanded(places, 0.5, 2.0, albedo, torch.zeros(len(places.view)), log_scale=0.1, by=by)
+        for by in (BOUNCES_BY, ["scale"])
+    )
+    for scale in (0.1, 0.2):
+        torch.testing.assert_close(part.irradiance(0.5, 2.0, scale), whole.irradiance(0.5, 2.0, scale))
+    assert (part.irradiance(0.9, 1.5, 0.1) == part.irradiance(0.5, 2.0, 0.1)).all()
 
 
 def test_the_expansion_follows_the_response_through_which_photos_tell_the_albedo(sphere):

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 import tube_twin
 
 from endotwin.effects import Effects
@@ -19,6 +20,9 @@ from endotwin.effects.vignetting import Vignetting
 from endotwin.fit.gauss_newton import GaussNewton
 from endotwin.fit.lighting import Relighting, lit
 from endotwin.fit.model import Globals, at_pixels, predict
+from endotwin.fit.normal_equations import Residual
+from endotwin.fit.state import State
+from endotwin.fit.tilt import Tilter
 from endotwin.render import Renderer
 from endotwin.surface.casting import Caster
 from endotwin.twin import Twin
@@ -55,9 +59,8 @@ def tube() -> Twin:
     return replace(twin, materials=replace(twin.materials, metallic=0 * twin.materials.metallic))
 
 
-@pytest.mark.parametrize("scene", SCENES)
-def test_the_renderers_pixels_are_what_the_fit_predicts(tube, scene):
-    effects = Effects([Specular(), *SCENES[scene]])
+def seen_by_the_fit(tube: Twin, effects: Effects) -> tuple[GaussNewton, State]:
+    """The tube's pixels under ``effects`` as the fit has them, and what it would fit."""
     twin, caster = replace(tube, effects=effects), Caster(tube.surface)
     samples, state = tube_twin.photographed(tube, tube.camera, POSES), tube_twin.state_of(tube)
     shared = Globals.of(twin.light, twin.response, twin.materials.f0, bounce=bool(effects.bounce))
@@ -66,8 +69,19 @@ def test_the_renderers_pixels_are_what_the_fit_predicts(tube, scene):
     relighting = Relighting(tube.surface, caster, effects.without(["gain"]), samples.views)
     solver = GaussNewton(lit(samples, tube.surface, caster, effects), tube.surface.triangles, state.operator)
     relighting(solver, state)
+    return solver, state
+
+
+def shown_to_the_fit(solver: GaussNewton, state: State) -> np.ndarray:
     material = at_pixels(solver.samples, solver.triangles, state.materials)
-    predicted = predict(solver.samples, material, state.shared).clamp(0, 1).numpy()
+    return predict(solver.samples, material, state.shared).numpy()
+
+
+@pytest.mark.parametrize("scene", SCENES)
+def test_the_renderers_pixels_are_what_the_fit_predicts(tube, scene):
+    effects = Effects([Specular(), *SCENES[scene]])
+    twin, (solver, state) = replace(tube, effects=effects), seen_by_the_fit(tube, effects)
+    samples, predicted = solver.samples, shown_to_the_fit(solver, state).clip(0, 1)
 
     renderer, compared = Renderer(twin), 0
     for frame, pose in enumerate(POSES):
@@ -82,6 +96,16 @@ def test_the_renderers_pixels_are_what_the_fit_predicts(tube, scene):
         assert np.quantile(apart, 0.999 if effects.bounce else 1.0) < LEVEL
         assert np.median(apart) < 0.1 * LEVEL
     assert compared > 0.75 * len(samples)
+
+
+@pytest.mark.parametrize("scene", SCENES)
+def test_a_tilt_of_the_normals_starts_from_what_the_fit_predicts(tube, scene):
+    effects = Effects([Specular(), *SCENES[scene]])
+    solver, state = seen_by_the_fit(tube, effects)
+    tilter = Tilter(solver, state, effects)
+    _, _, residual = tilter._slopes(solver.samples, tube.surface.normals, np.inf)
+    fitted = Residual.of(solver.samples, torch.from_numpy(shown_to_the_fit(solver, state)), np.inf)
+    np.testing.assert_allclose(residual.error, fitted.error, atol=2e-5)
 
 
 @pytest.mark.parametrize("scene", [name for name in SCENES if name not in ("light", "gain")])

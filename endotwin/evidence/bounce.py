@@ -63,7 +63,7 @@ def bounced(probe: Probe, hypothesis: Hypothesis) -> Bounced:
             base_color, L0 = _patch_albedo(linear, light_there, patch, radiosity.count, brightest)
             albedo = Albedo(base_color, glossy)
             light_there = direct_light + seen(light.at(places, n, q, albedo.scaled(0.0)), base_color)
-        found = light.expanded(places, n, q, albedo, gloss)
+        found = light.expanded(places, n, q, albedo, gloss, by=("n", "q"))
         log = np.log(np.maximum(seen(found.irradiance(n, q).numpy(), base_color), 1e-30))
         return Bounced(log, found.by_n.numpy(), found.by_q.numpy(), L0)
 

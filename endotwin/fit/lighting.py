@@ -20,7 +20,7 @@ from endotwin.fit.model import Globals, at_pixels, slope_by_log_exposure
 from endotwin.fit.normal_equations import CHUNK, Residual
 from endotwin.fit.state import State
 from endotwin.fit.within import Renewed, Varied
-from endotwin.light.bounced import GAMMA_STEP, Albedo, BouncedLight, Places
+from endotwin.light.bounced import GAMMA_STEP, BOUNCES_BY, Albedo, BouncedLight, Places
 from endotwin.light.guides import AT_LENS, COSINE, Guided, guided, log_axis, visible_in_views
 from endotwin.light.mirror import met_mirrored
 from endotwin.light.radiosity import Radiosity
@@ -98,7 +98,7 @@ class Relighting:
     ):
         if "gain" in effects:
             effects = effects.including(effects["gain"].at(views.frames))
-        self.effects, self.faint = effects, faint
+        self.effects, self.faint, self._light_stays = effects, faint, False
         self._surface, self._caster = surface, caster
         self._bouncer = Bouncer(surface, caster, effects, views) if effects.bounce else None
 
@@ -168,6 +168,10 @@ class Relighting:
             return samples
         return replace(samples, guides=_guided(samples, self._surface, self._caster, self.effects))
 
+    def keep_light(self) -> None:
+        """From here on light and response stay: what they would change of bounced light is not asked for."""
+        self._light_stays = True
+
     def without_bounce(self, solver: GaussNewton, state: State) -> State:
         """From here on no light bounces: the photos show none. ``state`` as if there had never been any."""
         self._bouncer = None
@@ -182,7 +186,8 @@ class Relighting:
             return samples
         materials = state.materials
         roughness = at_pixels(samples, triangles, materials[:, 3:])[:, 0]
-        return self._bouncer.bounced(samples, roughness, materials, triangles, state.shared)
+        shared, stays = state.shared, self._light_stays
+        return self._bouncer.bounced(samples, roughness, materials, triangles, shared, stays)
 
     def relit(self, samples: Samples, triangles: Tensor, state: State) -> Samples:
         """``bounced``, and with the gain and what is faint as they were found last."""
@@ -213,20 +218,31 @@ class Bouncer:
         self._light = BouncedLight(self._radiosity, views.T_local_camera, guides_mm, effects.profile)
 
     def bounced(
-        self, samples: Samples, roughness: Tensor, materials: Tensor, triangles: Tensor, shared: Globals
+        self,
+        samples: Samples,
+        roughness: Tensor,
+        materials: Tensor,
+        triangles: Tensor,
+        shared: Globals,
+        light_stays: bool,
     ) -> Samples:
         """``samples``, whose ``roughness`` is [N], with the bounce under the light of ``shared`` and
-        ``materials`` [V, 4] at the corners of ``triangles`` [F, 3]."""
+        ``materials`` [V, 4] at the corners of ``triangles`` [F, 3]; where ``light_stays``, as a function of
+        the albedo's scale alone."""
         _, n, q = shared.log_light
         scale, lobes = shared.log_scale, shared.lobes.brighter(math.exp(shared.log_scale))
-        albedo = Albedo.of(self._radiosity, materials[:, :3], materials[:, 3], lobes, triangles.numpy())
-        places = self._places(samples, lobes.shine)
+
+        def albedo(base_color: Tensor) -> Albedo:
+            return Albedo.of(self._radiosity, base_color, materials[:, 3], lobes, triangles.numpy())
+
+        places, base_color = self._places(samples, lobes.shine), materials[:, :3]
         gloss = lobes.gloss(samples.cos, roughness) * math.exp(-scale)
-        steeper = materials[:, :3] ** (shared.gamma / (shared.gamma + GAMMA_STEP))
-        other = Albedo.of(self._radiosity, steeper, materials[:, 3], lobes, triangles.numpy())
-        seen_by = (shared.gamma, other)
-        bounce = self._light.expanded(places, n, q, albedo, gloss, scale, seen_by)
-        shown = shared.gamma * torch.log(at_pixels(samples, triangles, materials[:, :3]))
+        by, seen_by = ("scale",), None
+        if not light_stays:
+            steeper = base_color ** (shared.gamma / (shared.gamma + GAMMA_STEP))
+            by, seen_by = BOUNCES_BY, (shared.gamma, albedo(steeper))
+        bounce = self._light.expanded(places, n, q, albedo(base_color), gloss, scale, seen_by, by)
+        shown = shared.gamma * torch.log(at_pixels(samples, triangles, base_color))
         return replace(samples, bounce=replace(bounce, shown=shown))
 
     def _places(self, samples: Samples, shine: bool) -> Places:

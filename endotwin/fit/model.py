@@ -98,6 +98,14 @@ def radiance(samples: Samples, material: Tensor, shared: Globals) -> Tensor:
     return forward.radiance(lit, shared.log_light, material[:, :3], material[:, 3], shared.lobes)
 
 
+def glow(samples: Samples, material: Tensor, shared: Globals) -> Tensor | float:
+    """The share of ``radiance`` that is bounced light, [N, 3], which does not depend on the normal; 0 where
+    none bounces."""
+    if samples.bounce is None:
+        return 0.0
+    return forward.glow(_lit(samples, material[:, :3], shared), shared.log_light, material[:, :3])
+
+
 def _lit(samples: Samples, base_color: Tensor, shared: Globals) -> Lit:
     """What lights the samples, where light bounced off tissue of ``base_color`` [N, 3]."""
     lit, bounce = samples.lit(*shared.bouncing), samples.bounce
@@ -109,7 +117,12 @@ def _lit(samples: Samples, base_color: Tensor, shared: Globals) -> Lit:
 
 def predict(samples: Samples, material: Tensor, shared: Globals) -> Tensor:
     """Display values C [N, 3]; above 1 where a photo would clip."""
-    untoned = shading.respond(radiance(samples, material, shared), shared.gamma)
+    return displayed(radiance(samples, material, shared), shared)
+
+
+def displayed(x: Tensor, shared: Globals) -> Tensor:
+    """Display values of radiance ``x``."""
+    untoned = shading.respond(x, shared.gamma)
     return untoned if shared.tone is None else shared.tone.shown(untoned)
 
 

@@ -266,6 +266,7 @@ class _Fit:
             return State(None, at_vertices, None, coarse.shared), normals, None
         operator, samples = finer
         state = State(operator, at_vertices, torch.zeros(operator.forward_csr.shape[1], 4), coarse.shared)
+        relighting.keep_light()
         unit, mesh = unit_mm(surface), surface.triangles
         solver = GaussNewton(samples, mesh, operator, unit, 0, pace.out_of_time, self.device)
         step_s = 0.0

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -40,7 +41,7 @@ class State:
     table: Tensor | None
     shared: Globals
 
-    @property
+    @cached_property
     def raw(self) -> Tensor:
         """θ = θ̄ + A·table, [V, 4]."""
         return self.mean if self.operator is None else self.mean + self.operator(self.table)
@@ -50,7 +51,7 @@ class State:
         """Whether places may differ in their materials: before the first step they do not."""
         return self.mean.dim() == 2 or bool(self.table.any())
 
-    @property
+    @cached_property
     def materials(self) -> Tensor:
         """Base colour and roughness of every vertex, [V, 4]."""
         raw = self.raw
@@ -60,7 +61,7 @@ class State:
             dim=1,
         )
 
-    @property
+    @cached_property
     def link_slope(self) -> Tensor:
         """d materials / dθ, [V, 4]. Base colour keeps its slope at the clamp, so that it can come back."""
         raw, gamma = self.raw, self.shared.gamma

@@ -15,10 +15,10 @@ from torch import Tensor
 
 from endotwin.effects import Effects
 from endotwin.fit.gauss_newton import HUBER, TEMPER, GaussNewton, conjugate_gradients
-from endotwin.fit.model import at_pixels, predict
+from endotwin.fit.model import at_pixels, displayed, glow, radiance
 from endotwin.fit.normal_equations import CHUNK, Residual, add_products, pairs_of
 from endotwin.fit.state import State
-from endotwin.light.guides import guided
+from endotwin.light.guides import Incoming
 from endotwin.light.incidence import COS_MIN
 from endotwin.pixels.samples import Samples
 from endotwin.run.ahead import on_all_cores
@@ -115,13 +115,14 @@ class Tilter:
     ) -> tuple[np.ndarray, Tensor, Residual]:
         """By which tilt N samples change most: its axis in the surface's frame [N, 3], and dC by its
         radians [N, 3]; and their residuals, robust beyond ``width``."""
-        rotation, view = samples.rotation, samples.directions
+        rotation, view, shared = samples.rotation, samples.directions, self.state.shared
         normal = at_pixels(samples, self.solver.triangles, torch.from_numpy(normals)).numpy()
         normal = unit(np.einsum("na,nab->nb", normal, rotation))
         material = at_pixels(samples, self.solver.triangles, self.state.materials)
+        direct, bounced = _Direct.of(samples, view, self.effects), glow(samples, material, shared)
 
         def shown(tilted: np.ndarray) -> Tensor:
-            return predict(_seen(samples, tilted, view, self.effects), material, self.state.shared)
+            return displayed(radiance(direct.seen(tilted), material, shared) + bounced, shared)
 
         predicted = shown(normal)
         towards = unit(-view + dot(normal, view)[:, None] * normal)
@@ -133,20 +134,34 @@ class Tilter:
         return np.einsum("nb,nab->na", axis, rotation), slope, Residual.of(samples, predicted, width)
 
 
-def _seen(samples: Samples, normal: np.ndarray, view: np.ndarray, effects: Effects) -> Samples:
-    """``samples`` with unit ``normal`` [N, 3], seen along ``view`` [N, 3], both in the camera frame."""
-    cos = -dot(normal, view)
-    tangential = normal + cos[:, None] * view
-    guides = samples.guides
-    if guides is not None:
-        visible = (guides.cos_i > 0).numpy()
-        guides = guided(samples.points_mm, normal, np.asarray(effects.guides_mm), effects.profile, visible)
-    return replace(
-        samples,
-        cos=torch.from_numpy(np.maximum(cos, COS_MIN)),
-        sin2=torch.from_numpy(dot(tangential, tangential)),
-        guides=guides,
-    )
+@dataclass(frozen=True)
+class _Direct:
+    """``samples`` under the light of the guides alone, seen along ``view`` [N, 3], camera frame; what of that
+    no normal changes: ``incoming``, and which guides each sees."""
+
+    samples: Samples
+    view: np.ndarray
+    incoming: Incoming | None
+    visible: np.ndarray | None
+
+    @classmethod
+    def of(cls, samples: Samples, view: np.ndarray, effects: Effects) -> _Direct:
+        guides, incoming, visible = samples.guides, None, None
+        if guides is not None:
+            visible = (guides.cos_i > 0).numpy()
+            incoming = Incoming.at(samples.points_mm, np.asarray(effects.guides_mm), effects.profile)
+        return cls(replace(samples, bounce=None), view, incoming, visible)
+
+    def seen(self, normal: np.ndarray) -> Samples:
+        """The samples with unit ``normal`` [N, 3], camera frame."""
+        cos = -dot(normal, self.view)
+        tangential = normal + cos[:, None] * self.view
+        return replace(
+            self.samples,
+            cos=torch.from_numpy(np.maximum(cos, COS_MIN)),
+            sin2=torch.from_numpy(dot(tangential, tangential)),
+            guides=None if self.incoming is None else self.incoming.on(normal, self.visible),
+        )
 
 
 def _steepest(axes: list[np.ndarray], slopes: list[Tensor]) -> tuple[np.ndarray, Tensor]:

@@ -6,6 +6,7 @@ n and q and of how bright the tissue is.
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -19,8 +20,8 @@ from endotwin.light.radiosity import Radiosity
 from endotwin.run.ahead import on_all_cores
 from endotwin.surface.rows import Rows
 
-LIGHT_STEP = 0.05
-"""Step of the finite differences of the bounced light, in n, q and the logarithm of all albedo."""
+BOUNCES_BY, LIGHT_STEP = ("n", "q", "scale"), 0.05
+"""What bounced light depends on, n, q and the logarithm of all albedo, and the step of finite differences."""
 
 GAMMA_STEP = 0.01
 """That in γ."""
@@ -202,11 +203,13 @@ class BouncedLight:
         gloss: Tensor,
         log_scale: float = 0.0,
         seen_by: tuple[float, Albedo] | None = None,
+        by: Collection[str] = BOUNCES_BY,
     ) -> Bounce:
         """The bounce as a function of n, q, the albedo's scale and γ, exact where they are as given here.
 
         ``gloss`` [N] is the bounce's. ``seen_by``: γ, and the albedo that photos tell of with γ + GAMMA_STEP;
-        None: whatever γ, the albedo is the same.
+        None: whatever γ, the albedo is the same. ``by``: those of BOUNCES_BY that are to change; each of them
+        takes its time.
         """
 
         def log_irradiance(n: float, q: float, log_scale: float, albedo: Albedo = albedo) -> np.ndarray:
@@ -214,19 +217,16 @@ class BouncedLight:
 
         arriving, leaving = self.between(n, q, albedo.scaled(log_scale))
         irradiance = np.maximum(places.of(arriving), DARKEST)
-        here = np.log(irradiance)
-        moved = [
-            (n + LIGHT_STEP, q, log_scale),
-            (n, q + LIGHT_STEP, log_scale),
-            (n, q, log_scale + LIGHT_STEP),
-        ]
+        here, about = np.log(irradiance), np.array([n, q, log_scale])
+        moved = [tuple(about + LIGHT_STEP * (np.array(BOUNCES_BY) == name)) for name in by]
+        gamma, by_gamma = 0.0, np.zeros_like(here)
         if seen_by is not None:
             moved.append((n, q, log_scale, seen_by[1]))
         changed = [found - here for found in on_all_cores(lambda at: log_irradiance(*at), moved)]
-        by_n, by_q, by_scale = (change / LIGHT_STEP for change in changed[:3])
-        gamma, by_gamma = 0.0, np.zeros_like(here)
         if seen_by is not None:
-            gamma, by_gamma = seen_by[0], changed[3] / GAMMA_STEP
+            gamma, by_gamma = seen_by[0], changed.pop() / GAMMA_STEP
+        slopes = {name: change / LIGHT_STEP for name, change in zip(by, changed, strict=True)}
+        by_n, by_q, by_scale = (slopes.get(name, np.zeros_like(here)) for name in BOUNCES_BY)
         by_n, by_q = by_n.mean(axis=1), by_q.mean(axis=1)
         level = here - (n * by_n + q * by_q)[:, None] - log_scale * by_scale - gamma * by_gamma
         columns = [

@@ -158,7 +158,10 @@ def radiance(lit: Lit, log_light: LogLight, base_color: Tensor, roughness: Tenso
     x = sum(share.per_color for share in found)[:, None] * base_color
     if found[0].white(lobes) is not None:
         x = x + sum(share.white(lobes) for share in found)[:, None]
-    if lit.irradiance is None:
-        return x
+    return x if lit.irradiance is None else x + glow(lit, log_light, base_color)
+
+
+def glow(lit: Lit, log_light: LogLight, base_color: Tensor) -> Tensor:
+    """The share of ``radiance`` that other tissue throws on the points, [N, 3]."""
     per_color, mirrored = bounced(lit, log_light)
-    return x + per_color * base_color + mirrored * lit.gloss[:, None]
+    return per_color * base_color + mirrored * lit.gloss[:, None]

@@ -59,6 +59,52 @@ def log_axis(cos_axis: np.ndarray, profile: float) -> np.ndarray:
     return (1 - profile) * np.log(cos_axis) + profile * (cos_axis - 1)
 
 
+@dataclass(frozen=True)
+class Incoming:
+    """How light of K guides comes to N points, whatever their normals.
+
+    Attributes:
+        wi, wm: [N, 3] of each guide. cos_d, log_axis, log_distance: [N] of each, as in ``Guided``.
+    """
+
+    wi: list[np.ndarray]
+    wm: list[np.ndarray]
+    cos_d: list[np.ndarray]
+    log_axis: list[np.ndarray]
+    log_distance: list[np.ndarray]
+
+    @classmethod
+    def at(cls, points_mm: np.ndarray, guides_mm: np.ndarray, profile: float) -> Incoming:
+        """From guides at ``guides_mm`` [K, 3] to ``points_mm`` [N, 3], both in the camera frame; each guide
+        shines along the optical axis."""
+        found, wo = cls([], [], [], [], []), unit(-points_mm)
+        for guide_mm in np.asarray(guides_mm, np.float32):
+            towards = guide_mm - points_mm
+            distance_mm = np.maximum(np.sqrt(dot(towards, towards)), DISTANCE_MIN_MM)
+            wi = towards / distance_mm[:, None]
+            wm = unit(wi + wo)
+            found.wi.append(wi)
+            found.wm.append(wm)
+            found.cos_d.append(dot(wi, wm))
+            found.log_axis.append(log_axis(np.maximum(-wi[:, 2], COS_MIN), profile))
+            found.log_distance.append(np.log(distance_mm))
+        return found
+
+    def on(self, normals: np.ndarray, visible: np.ndarray | None = None) -> Guided:
+        """On unit ``normals`` [N, 3], camera frame.
+
+        Args:
+            visible: [N, K], share of each guide that the point sees; all of it unless given.
+        """
+        cos_i, sin2_m = [], []
+        for k, (wi, wm) in enumerate(zip(self.wi, self.wm, strict=True)):
+            across, cos = np.cross(normals, wm), np.maximum(dot(normals, wi), 0)
+            cos_i.append(cos if visible is None else cos * visible[:, k])
+            sin2_m.append(dot(across, across))
+        columns = (cos_i, sin2_m, self.cos_d, self.log_axis, self.log_distance)
+        return Guided(*(torch.from_numpy(np.stack(each)).T for each in columns))
+
+
 def guided(
     points_mm: np.ndarray,
     normals: np.ndarray,
@@ -66,28 +112,9 @@ def guided(
     profile: float,
     visible: np.ndarray | None = None,
 ) -> Guided:
-    """What guides at ``guides_mm`` [K, 3] do to ``points_mm`` [N, 3] with unit ``normals`` [N, 3].
-
-    Everything is in the camera frame; each guide shines along the optical axis.
-
-    Args:
-        visible: [N, K], share of each guide that the point sees; all of it unless given.
-    """
-    columns = {name: [] for name in Guided.__dataclass_fields__}
-    wo = unit(-points_mm)
-    for k, guide_mm in enumerate(np.asarray(guides_mm, np.float32)):
-        towards = guide_mm - points_mm
-        distance_mm = np.maximum(np.sqrt(dot(towards, towards)), DISTANCE_MIN_MM)
-        wi = towards / distance_mm[:, None]
-        wm = unit(wi + wo)
-        across = np.cross(normals, wm)
-        cos_i = np.maximum(dot(normals, wi), 0)
-        columns["cos_i"].append(cos_i if visible is None else cos_i * visible[:, k])
-        columns["sin2_m"].append(dot(across, across))
-        columns["cos_d"].append(dot(wi, wm))
-        columns["log_axis"].append(log_axis(np.maximum(-wi[:, 2], COS_MIN), profile))
-        columns["log_distance"].append(np.log(distance_mm))
-    return Guided(**{name: torch.from_numpy(np.stack(value)).T for name, value in columns.items()})
+    """What guides at ``guides_mm`` [K, 3] do to ``points_mm`` [N, 3] with unit ``normals`` [N, 3], of which
+    they see as much as ``visible`` [N, K] says."""
+    return Incoming.at(points_mm, guides_mm, profile).on(normals, visible)
 
 
 def visible_from(
