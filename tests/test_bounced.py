@@ -10,7 +10,7 @@ import trimesh
 from independent.gloss import Gloss
 
 from endotwin.fusion.mesh import surface_of
-from endotwin.light.bounced import GAMMA_STEP, BOUNCES_BY, Albedo, BouncedLight, Places
+from endotwin.light.bounced import BOUNCES_BY, GAMMA_STEP, Albedo, BouncedLight, Places
 from endotwin.light.forward import Lobes
 from endotwin.light.guides import AT_LENS, COSINE
 from endotwin.light.radiosity import Radiosity

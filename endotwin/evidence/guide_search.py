@@ -68,7 +68,7 @@ def found_guides(
     plain, best, guides_mm = probe.fit(base), None, ()
     if near_mm != AT_LENS:
         near = replace(base, guides_mm=near_mm, shadows=True)
-        near = replace(near, guides_mm=Search.of(probe, near, glints).polished())
+        near = replace(near, guides_mm=Search.of(probe, near, glints).settled())
         if probe.compare(plain, probe.fit(near)).keep:
             return near.guides_mm
     search = Search.of(probe, base, glints)
@@ -82,7 +82,7 @@ def found_guides(
             worth = probe.compare(settled(probe, best, glints), found).keep
         if worth or (forced and best is None and number == MOST_GUIDES):
             best = found
-    return AT_LENS if best is None else Search.of(probe, best.hypothesis, glints).polished()
+    return AT_LENS if best is None else Search.of(probe, best.hypothesis, glints).settled()
 
 
 def settled(probe: Probe, model: Fitted, glints: Glints) -> Fitted:

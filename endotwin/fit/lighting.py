@@ -20,7 +20,7 @@ from endotwin.fit.model import Globals, at_pixels, slope_by_log_exposure
 from endotwin.fit.normal_equations import CHUNK, Residual
 from endotwin.fit.state import State
 from endotwin.fit.within import Renewed, Varied
-from endotwin.light.bounced import GAMMA_STEP, BOUNCES_BY, Albedo, BouncedLight, Places
+from endotwin.light.bounced import BOUNCES_BY, GAMMA_STEP, Albedo, BouncedLight, Places
 from endotwin.light.guides import AT_LENS, COSINE, Guided, guided, log_axis, visible_in_views
 from endotwin.light.mirror import met_mirrored
 from endotwin.light.radiosity import Radiosity
