@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from endotwin.config import FitConfig
-from endotwin.pixels.pace import Pace, spread_order
+from endotwin.pixels.pace import ITERATIONS, Pace, spread_order
 
 
 @given(st.integers(1, 300))
@@ -35,6 +35,14 @@ def test_a_budget_that_is_spent_still_reads_one_photo_and_then_nothing():
     time.sleep(2e-3)
     assert len(list(pace.photos(list(range(50))))) == 1
     assert pace.out_of_time() and pace.light_is_over() and pace.left() == 0
+
+
+def test_light_that_is_found_again_beside_a_tone_curve_has_time_of_its_own_and_leaves_some_for_the_detail():
+    pace = Pace(FitConfig(budget=100))
+    once = pace.light_left
+    pace.find_light_again()
+    assert once + 20 < pace.light_left < pace.left(ITERATIONS) - 10
+    assert not pace.light_is_over()
 
 
 def test_pixels_grow_with_the_budget_up_to_those_of_the_plan():

@@ -28,7 +28,7 @@ from endotwin.fit.state import State, as_bouncing, halfway, mixed, roughness_to_
 from endotwin.fit.within import Renewed, Within
 from endotwin.light.shading import F0_DIELECTRIC, ROUGHNESS_TISSUE
 from endotwin.pixels.length_unit import unit_mm
-from endotwin.pixels.pace import LIGHT, Pace
+from endotwin.pixels.pace import Pace
 from endotwin.pixels.samples import Samples
 from endotwin.pixels.start import Start
 from endotwin.surface import Surface
@@ -268,7 +268,7 @@ class LightStage:
 
     @property
     def _late(self) -> bool:
-        return self._pace.left(LIGHT) <= 2 * self._cost.step_s
+        return self._pace.light_left <= 2 * self._cost.step_s
 
     @property
     def _noise(self) -> float:

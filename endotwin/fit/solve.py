@@ -222,6 +222,7 @@ class _Fit:
         if first.found.toned is None:
             return first
         began = self.pace.stopwatch.total
+        self.pace.find_light_again()
         again = self._lighted(pixels, start, first)
         return replace(again, again_s=self.pace.stopwatch.total - began)
 

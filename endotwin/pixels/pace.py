@@ -13,8 +13,9 @@ from collections.abc import Callable, Iterator
 from endotwin.config import FitConfig
 from endotwin.run.stopwatch import Stopwatch
 
-GATHER, LIGHT, ITERATIONS = 0.2, 0.4, 0.92
-"""Shares of the budget after which no photo is read, no step looks for the light, no iteration begins."""
+GATHER, LIGHT, LIGHT_AGAIN, ITERATIONS = 0.2, 0.4, 0.7, 0.92
+"""Shares of the budget after which no photo is read, no step looks for the light, nor, where a tone curve was
+found and taken off the photos, for the light beside it, and no iteration begins."""
 
 PIXELS_A_SECOND = 100_000
 """Pixels a second of budget: more would leave no time to fit them."""
@@ -37,6 +38,7 @@ class Pace:
         self.stopwatch = Stopwatch()
         self.report = report or (lambda label, done, total: None)
         self.budget_s = plan.budget or math.inf
+        self._light = LIGHT
 
     @property
     def pixels(self) -> int:
@@ -70,9 +72,18 @@ class Pace:
         """Seconds until so much of the budget is used, at least 0."""
         return max(0.0, share * self.budget_s - self.stopwatch.total)
 
+    @property
+    def light_left(self) -> float:
+        """Seconds until the light's steps should end, at least 0."""
+        return self.left(self._light)
+
     def light_is_over(self) -> bool:
         """Whether the light's steps should end."""
-        return not self.left(LIGHT)
+        return not self.light_left
+
+    def find_light_again(self) -> None:
+        """What has been found of the light was found beside photos under a tone curve: there is more time."""
+        self._light = LIGHT_AGAIN
 
     def out_of_time(self) -> bool:
         """Whether no iteration should begin any more."""
