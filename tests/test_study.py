@@ -27,6 +27,7 @@ from endotwin.study.corruptions import CORRUPTIONS
 from endotwin.study.frames import kept, of_dataset, of_sequence
 from endotwin.study.leak import LeakError, require_unseen
 from endotwin.study.recipe import EVERYTHING, INGREDIENTS, RENDERED
+from endotwin.study.report import Findings, answer
 from endotwin.study.run import Plan
 from endotwin.synth import read_variation
 from endotwin.synth.variation import Variation
@@ -315,3 +316,20 @@ def test_arms_of_the_curve_have_fewer_frames_than_there_are():
     names = [arm.name for arm in arms(parse_parts("curve"), 500)]
     assert names == ["real", "rendered", "both", "rendered@50", "rendered@100", "rendered@200"]
     assert json.dumps(parse_parts("all")) == '["headline", "ingredients", "curve", "robustness"]'
+
+
+@pytest.mark.parametrize(
+    ("real", "rendered", "both", "told"),
+    [
+        ((0.2, 0.202, 0.198), (0.1, 0.101, 0.099), (0.05, 0.051, 0.049), ("better than", "better than")),
+        ((0.1, 0.101, 0.099), (0.2, 0.202, 0.198), (0.3, 0.302, 0.298), ("worse than", "worse than")),
+        ((0.060, 0.064, 0.062), (0.058, 0.064, 0.061), (0.060, 0.068, 0.064), ("like", "as good as")),
+    ],
+)
+def test_no_difference_is_claimed_that_seeds_alone_would_make(real, rendered, both, told):
+    runs = {
+        name: [[{"metric": {"abs_rel": value}}] for value in values]
+        for name, values in (("real", real), ("rendered", rendered), ("both", both))
+    }
+    said = answer(Findings({"tests": ["cecum"], "seeds": 3}, list(HEADLINE), runs, []))
+    assert f"{told[0]} on real ones" in said and f"both together are {told[1]} the better" in said
