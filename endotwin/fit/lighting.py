@@ -98,7 +98,7 @@ class Relighting:
     ):
         if "gain" in effects:
             effects = effects.including(effects["gain"].at(views.frames))
-        self.effects, self.faint, self._light_stays = effects, faint, False
+        self.effects, self.faint = effects, faint
         self._surface, self._caster = surface, caster
         self._bouncer = Bouncer(surface, caster, effects, views) if effects.bounce else None
 
@@ -169,8 +169,9 @@ class Relighting:
         return replace(samples, guides=_guided(samples, self._surface, self._caster, self.effects))
 
     def keep_light(self) -> None:
-        """From here on light and response stay: what they would change of bounced light is not asked for."""
-        self._light_stays = True
+        """From here on light and response stay."""
+        if self.bounces:
+            self._bouncer.light_stays = True
 
     def without_bounce(self, solver: GaussNewton, state: State) -> State:
         """From here on no light bounces: the photos show none. ``state`` as if there had never been any."""
@@ -186,8 +187,7 @@ class Relighting:
             return samples
         materials = state.materials
         roughness = at_pixels(samples, triangles, materials[:, 3:])[:, 0]
-        shared, stays = state.shared, self._light_stays
-        return self._bouncer.bounced(samples, roughness, materials, triangles, shared, stays)
+        return self._bouncer.bounced(samples, roughness, materials, triangles, state.shared)
 
     def relit(self, samples: Samples, triangles: Tensor, state: State) -> Samples:
         """``bounced``, and with the gain and what is faint as they were found last."""
@@ -208,27 +208,24 @@ class Relighting:
 
 
 class Bouncer:
-    """Interreflection of the training views, renewed from the albedo and the light that the fit has found."""
+    """Interreflection of the training views, renewed from the albedo and the light that the fit has found.
+
+    Attributes:
+        light_stays: light and response are held, so that what they change of it is not asked for.
+    """
 
     def __init__(self, surface: Surface, caster: Caster, effects: Effects, views: Views):
-        self._surface, self._caster = surface, caster
+        self._surface, self._caster, self.light_stays = surface, caster, False
         self._placed: tuple[Tensor | None, Places | None] = None, None
         self._radiosity = Radiosity(surface, caster, effects["interreflection"].cell_mm)
         guides_mm = effects.guides_mm or AT_LENS
         self._light = BouncedLight(self._radiosity, views.T_local_camera, guides_mm, effects.profile)
 
     def bounced(
-        self,
-        samples: Samples,
-        roughness: Tensor,
-        materials: Tensor,
-        triangles: Tensor,
-        shared: Globals,
-        light_stays: bool,
+        self, samples: Samples, roughness: Tensor, materials: Tensor, triangles: Tensor, shared: Globals
     ) -> Samples:
         """``samples``, whose ``roughness`` is [N], with the bounce under the light of ``shared`` and
-        ``materials`` [V, 4] at the corners of ``triangles`` [F, 3]; where ``light_stays``, as a function of
-        the albedo's scale alone."""
+        ``materials`` [V, 4] at the corners of ``triangles`` [F, 3]."""
         _, n, q = shared.log_light
         scale, lobes = shared.log_scale, shared.lobes.brighter(math.exp(shared.log_scale))
 
@@ -238,7 +235,7 @@ class Bouncer:
         places, base_color = self._places(samples, lobes.shine), materials[:, :3]
         gloss = lobes.gloss(samples.cos, roughness) * math.exp(-scale)
         by, seen_by = ("scale",), None
-        if not light_stays:
+        if not self.light_stays:
             steeper = base_color ** (shared.gamma / (shared.gamma + GAMMA_STEP))
             by, seen_by = BOUNCES_BY, (shared.gamma, albedo(steeper))
         bounce = self._light.expanded(places, n, q, albedo(base_color), gloss, scale, seen_by, by)
