@@ -110,7 +110,7 @@ def _curve(axes: Axes, findings: Findings) -> None:
     axes.set_xscale("log")
     axes.set_xticks(counts, list(map(str, counts)))
     axes.minorticks_off()
-    axes.legend(frameon=False, fontsize=8)
+    axes.legend(framealpha=1, edgecolor="none", fontsize=8)
     axes.set(xlabel="rendered frames (dotted: real ones)", ylabel="AbsRel", title="More frames, equal steps")
 
 
