@@ -7,7 +7,8 @@ from pathlib import Path
 
 import yaml
 
-TRANSLATION_MM, ROTATION_DEG = 5, 8
+TRAJECTORY = "jitter:translation=5,rotation=8"
+"""Poses of what is rendered, in mm and degrees about the recorded ones (docs/study.md)."""
 
 OTHER_LENSES = 1 / 5
 """Share of frames that are rendered through other lenses than the twin's own, where a recipe asks for any."""

@@ -38,7 +38,7 @@ from endotwin.study.arms import HEADLINE, Arm, arms
 from endotwin.study.frames import Frames, kept, lit_pixels, of_dataset, of_sequence, require_depth
 from endotwin.study.leak import require_unseen
 from endotwin.study.networks import found, network
-from endotwin.study.recipe import OTHER_LENSES, RENDERED, ROTATION_DEG, TRANSLATION_MM, Recipe
+from endotwin.study.recipe import OTHER_LENSES, RENDERED, TRAJECTORY, Recipe
 from endotwin.study.train import LOSSES, Course, train
 from endotwin.tradeoff.run import PARTIAL, machine
 from endotwin.twin import Twin
@@ -245,7 +245,7 @@ class _Experiment:
             _keep(lens.to_dict(), lens_file)
             pipeline.synthesize(
                 twin,
-                f"jitter:frames={count},translation={TRANSLATION_MM},rotation={ROTATION_DEG}",
+                f"{TRAJECTORY},frames={count}",
                 data,
                 vary=self.work / "recipes" / f"{recipe.name}.yaml",
                 camera=lens_file,
@@ -345,7 +345,7 @@ class _Experiment:
             "twins": [folder.name for folder in self.twins],
             "tests": _names(self.tests),
             "test_frames": [len(sequence) for sequence in self.tests],
-            "trajectory": f"jitter:translation={TRANSLATION_MM},rotation={ROTATION_DEG}",
+            "trajectory": TRAJECTORY,
             "unseen": self.unseen,
             "machine": machine(),
         }
