@@ -45,6 +45,15 @@ def test_light_that_is_found_again_beside_a_tone_curve_has_time_of_its_own_and_l
     assert not pace.light_is_over()
 
 
+def test_light_may_take_all_that_the_detail_leaves_of_a_budget_but_never_has_less_than_its_share():
+    pace = Pace(FitConfig(budget=100))
+    share = pace.light_left
+    pace.leave(20)
+    assert pace.light_left == pytest.approx(pace.left(ITERATIONS) - 20, abs=0.1)
+    pace.leave(90)
+    assert pace.light_left == pytest.approx(share, abs=1)
+
+
 def test_pixels_grow_with_the_budget_up_to_those_of_the_plan():
     pixels = [Pace(FitConfig(budget=budget)).pixels for budget in (1, 5, 20, 1000)]
     assert pixels == sorted(pixels) and pixels[0] < pixels[1] < pixels[2] <= pixels[3] == FitConfig().pixels

@@ -10,6 +10,7 @@ then searches along δ.
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cached_property
@@ -100,6 +101,9 @@ class GaussNewton:
 
     Sums over samples, products and conjugate gradients run on ``device``. What it is given and gives back
     lies on the CPU.
+
+    Attributes:
+        solve_s: seconds of the last step, of what does not take longer with more samples.
     """
 
     def __init__(
@@ -121,6 +125,7 @@ class GaussNewton:
         self.precision = prior_precision(operator, unit_mm).to(device)
         self._unit_mm = unit_mm
         self.held: tuple[str, ...] = ()
+        self.solve_s = 0.0
         self.out_of_time = out_of_time
         chosen = drawn(len(samples), SEARCH_SAMPLES, np.random.default_rng(seed))
         self.trial_rows = torch.from_numpy(chosen)
@@ -192,7 +197,9 @@ class GaussNewton:
         )
         free = free_directions(state.shared, self.held) if joint else np.zeros((len(state.shared.vector), 0))
         damping = len(self.samples) * scale * DAMPING**2 if state.shared.bounces else 0.0
+        began = time.perf_counter()
         table_step, shared_step = self._solve(state, equations, scale, free, damping)
+        self.solve_s = time.perf_counter() - began
         room = room_below_furnace(state, float(shared_step[-1])) if joint and state.shared.bounces else 1.0
         if room < LENGTHS[-1]:
             room, free = 1.0, free_directions(state.shared, (*self.held, "albedo scale"))

@@ -65,8 +65,9 @@ LEAVING = 2
 MISSES = 2
 """After so many steps by what varies that lead to nothing better, there is none more."""
 
-CONVERGED = 2e-4
-"""A step that changes the cost by a smaller share than this is the last."""
+CONVERGED, STEADY = 2e-4, 2e-3
+"""A step that changes the cost by a smaller share than this is the last; and so is one by what varies that
+changes γ, n and q by smaller ones: a tenth of what photos tell of them."""
 
 
 @dataclass(frozen=True)
@@ -75,13 +76,20 @@ class Cost:
 
     Attributes:
         setup_s, step_s: seconds of the operator and the solver, and of a step without the light.
-        weights: hash weights of its points. pixels: samples that the step summed over.
+        weights: hash weights of its points. pixels: samples that the step went through, in ``sums_s`` of its
+        seconds.
     """
 
     setup_s: float
     step_s: float
     weights: int
     pixels: int
+    sums_s: float
+
+    def detail_s(self, weights: int, pixels: int, steps: int) -> float:
+        """Seconds of so many ``steps`` with more weights and pixels; rather too many, since some of what a
+        step does with pixels takes no longer with more."""
+        return self.setup_s * weights / self.weights + steps * self.sums_s * pixels / self.pixels
 
 
 Toned = tuple[Tone, Decision]
@@ -89,11 +97,10 @@ Toned = tuple[Tone, Decision]
 
 @dataclass(frozen=True)
 class FoundLight:
-    """The state, what it cost, and whether there are a coat and a tone curve; ``toned``: a new curve, beside
-    which effects, light and materials are to be found again."""
+    """The state, and whether there are a coat and a tone curve; ``toned``: a new curve, beside which effects,
+    light and materials are to be found again."""
 
     state: State
-    cost: Cost
     decisions: dict[str, Decision]
     toned: Toned | None
 
@@ -114,8 +121,14 @@ class LightStage:
     """One search for light, response, f0 and coarse materials.
 
     Args:
-        samples: that tell the light. clipped: those that only say 'at least', to which a coat is held, too.
-        wanted: auto, on or off, of coat and tone. toned: a tone curve that was found before, and why.
+        samples: that tell the light, under it. clipped: those that only say 'at least', not lit, to which a
+            coat is held, too.
+        wanted: auto, on or off, of coat and tone. before: what was found before without the tone curve that
+            this found. Where light bounces and time is short, the search goes on from there; it ends better
+            where it begins anew.
+
+    Attributes:
+        cost: what its first step took.
     """
 
     def __init__(
@@ -128,12 +141,12 @@ class LightStage:
         relighting: Relighting,
         wanted: Mapping[str, str],
         device: torch.device,
-        toned: Toned | None,
+        before: FoundLight | None,
     ):
         self._clipped, self._surface, self._pace, self._wanted = clipped, surface, pace, wanted
         self._relighting, self._undetermined = relighting, start.undetermined
-        tone, decision = toned or (None, None)
-        self._decisions: dict[str, Decision] = {} if toned is None else {"tone": decision}
+        tone, decision = (None, None) if before is None else before.toned
+        self._decisions: dict[str, Decision] = {} if tone is None else {"tone": decision}
         self._unit_mm = unit_mm(surface)
         points, group = proxies(surface.vertices_mm, self._unit_mm * CELL_MM / PROXIES)
         began = pace.stopwatch.total
@@ -143,12 +156,20 @@ class LightStage:
         self._solver = GaussNewton(
             samples, triangles, operator, self._unit_mm, out_of_time=pace.light_is_over, device=device
         )
+        set_up = pace.stopwatch.total
         self._state = _started(operator, start, relighting, tone)
+        self._near = (
+            pace.hurried and before is not None and before.state.shared.bounces and relighting.bounces
+        )
+        if self._near:
+            shared = replace(before.state.shared, tone=tone)
+            self._state = replace(before.state, operator=operator, shared=shared)
         relighting(self._solver, self._state)
         ready = pace.stopwatch.total
         self._state, _ = self._stepped(self._state, joint=False)
         step_s = pace.stopwatch.total - ready
-        self._cost = Cost(ready - began, step_s, len(points) * len(operator.cells_mm), len(samples))
+        weights, sums_s = len(points) * len(operator.cells_mm), step_s - self._solver.solve_s
+        self.cost = Cost(set_up - began, step_s, weights, len(samples), sums_s)
 
     def found(self) -> FoundLight:
         """What is found; where that is a tone curve, as soon as it is."""
@@ -157,7 +178,7 @@ class LightStage:
             toned = self._in_turns()
         hurried = Decision("off", "no time to judge")
         decisions = dict.fromkeys(self._wanted, hurried) | self._decisions
-        return FoundLight(self._state, self._cost, decisions, toned)
+        return FoundLight(self._state, decisions, toned)
 
     def _in_turns(self) -> Toned | None:
         """Light by what varies within vertices, then the materials, then light again."""
@@ -180,7 +201,7 @@ class LightStage:
     def _in_one_step(self) -> Toned | None:
         """Light and materials in one step, for the strength of the bounce; then light by what varies. Ends
         early where photos show no bounce."""
-        number, best = 0, None
+        number, best = BOUNCE_COAT_STEP if self._near else 0, None
         while number < BOUNCE_STEPS and not self._late:
             if (toned := self._newly_toned(number, BOUNCE_COAT_STEP)) is not None:
                 return toned
@@ -213,11 +234,12 @@ class LightStage:
         for _ in range(STEPS):
             if self._pace.light_is_over() or missed == MISSES:
                 break
-            self._renew(self._state.shared, held, joint.noise)
+            stood = self._state.shared
+            self._renew(stood, held, joint.noise)
             self._settle()
             before, best = best, self._better(best)
             missed = missed + 1 if best is before else 0
-            if 0 < before.cost - best.cost < CONVERGED * before.cost:
+            if 0 < before.cost - best.cost < CONVERGED * before.cost or _steady(stood, self._state.shared):
                 break
         return joint if best.cost > WORSE * joint.cost else best
 
@@ -268,7 +290,7 @@ class LightStage:
 
     @property
     def _late(self) -> bool:
-        return self._pace.light_left <= 2 * self._cost.step_s
+        return self._pace.light_left <= 2 * self.cost.step_s
 
     @property
     def _noise(self) -> float:
@@ -300,7 +322,7 @@ class LightStage:
 
     def _newly_toned(self, number: int, step: int) -> Toned | None:
         """A tone curve and why, if this is the ``step`` in which it is judged, and there is one."""
-        if number != step or "tone" in self._decisions:
+        if number < step or "tone" in self._decisions:
             return None
         tone, self._decisions["tone"] = judged_tone(self._hues(), self._wanted["tone"])
         return None if tone is None else (tone, self._decisions["tone"])
@@ -312,7 +334,7 @@ class LightStage:
         if shared.tone is not None and number >= step:
             shared = replace(shared, tone=steadied(shared.tone, self._hues()))
             self._state = replace(self._state, shared=shared)
-        if "coat" not in self._decisions and number == (0 if self._wanted["coat"] == "on" else step):
+        if "coat" not in self._decisions and number >= (0 if self._wanted["coat"] == "on" else step):
             shared = self._coated()
         return shared
 
@@ -323,7 +345,7 @@ class LightStage:
     def _coated(self) -> Globals:
         """Light and response with the coat that highlights call for, clipped ones included."""
         solver, state, relighting = self._solver, self._state, self._relighting
-        under = relighting.relit(relighting.guided(self._clipped), solver.triangles, state)
+        under = relighting.relit(relighting.lit(self._clipped), solver.triangles, state)
         shiny = Samples.joined([solver.samples, under], solver.samples.views)
         material = at_pixels(shiny, solver.triangles, state.materials)
         seen = Within.of(shiny, self._surface, self._unit_mm)
@@ -371,6 +393,12 @@ class LightStage:
                 break
             moved = halfway(state, moved)
         return moved, before - after
+
+
+def _steady(before: Globals, after: Globals) -> bool:
+    """Whether light and response are hardly other than they were."""
+    pairs = zip((before.gamma, *before.log_light[1:]), (after.gamma, *after.log_light[1:]), strict=True)
+    return all(abs(now - was) < STEADY * max(was, STEADY) for was, now in pairs)
 
 
 def _started(operator: HashOperator, start: Start, relighting: Relighting, tone: Tone | None) -> State:

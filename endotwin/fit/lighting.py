@@ -137,7 +137,7 @@ class Relighting:
             guides_mm = np.asarray(self.effects.guides_mm) + found.aside_mm
             guides_mm[:, 2] = np.minimum(guides_mm[:, 2], 0)
             self.effects = self.effects.including(Offset(tuple(map(tuple, guides_mm.tolist()))))
-            samples = self.guided(samples)
+            samples = replace(samples, guides=_guided(samples, self._surface, self._caster, self.effects))
         if samples is not solver.samples:
             solver.relight(samples)
 
@@ -162,11 +162,9 @@ class Relighting:
         known = samples.log_exposure
         return replace(samples, log_exposure=faint if known is None else known + faint)
 
-    def guided(self, samples: Samples) -> Samples:
-        """``samples`` lit by the guides where they were found last."""
-        if not self.varied.guides:
-            return samples
-        return replace(samples, guides=_guided(samples, self._surface, self._caster, self.effects))
+    def lit(self, samples: Samples) -> Samples:
+        """``samples`` under all but bounced light and what is faint, as it was found last."""
+        return lit(samples, self._surface, self._caster, self.effects)
 
     def keep_light(self) -> None:
         """From here on light and response stay."""

@@ -26,7 +26,7 @@ from endotwin.fit.film import Found, Model
 from endotwin.fit.gauss_newton import CPU, GaussNewton, unusual
 from endotwin.fit.hashgrid import HashGrid, HashOperator
 from endotwin.fit.light_stage import Cost, FoundLight, LightStage
-from endotwin.fit.lighting import Relighting, lit
+from endotwin.fit.lighting import Relighting
 from endotwin.fit.sparkle import sparkle
 from endotwin.fit.state import State
 from endotwin.fit.tilt import Tilter
@@ -58,8 +58,8 @@ DETAIL_GROWTH = 1.6
 DETAIL_COARSEST_MM = 2.56
 """Coarsest cell that detail may correct: the light's pixels leave out the creases."""
 
-ASSEMBLY = 0.4
-"""Share of the time left for the detail that summing over its pixels may take."""
+SUMS = 0.4
+"""Share of the time left for the detail that going through its pixels once may take."""
 
 CERTAIN_NORMAL_DEG = 5.0
 """A triangle whose vertex normals differ by more bends too much for its normal to be certain."""
@@ -97,7 +97,7 @@ def fit_twin(
     lighted = fit.light(pixels, start)
     relighting = lighted.relighting
     with stopwatch.stage("detail"):
-        samples = relighting.guided(lighted.samples)
+        samples = relighting.lit(samples)
         state, normals, remains = fit.detail(lighted, samples)
         twin = replace(twin, surface=replace(surface, normals=normals))
     wet, beyond, why = fit.beyond(Model(twin, state, relighting, fit.caster), samples)
@@ -182,13 +182,13 @@ def _of_some_vertices(vertex: np.ndarray, count: int, generator: np.random.Gener
 
 @dataclass(frozen=True)
 class _Lighted:
-    """The effects that are decided, where the fit started beside them, what they make of the light, the
-    training samples under it, what is found, and the seconds that finding it again took."""
+    """The effects that are decided, where the fit started beside them, what they make of the light, what a
+    step cost, what is found, and the seconds that finding it again took."""
 
     decided: Decided
     start: Start
     relighting: Relighting
-    samples: Samples
+    cost: Cost
     found: FoundLight
     again_s: float = 0.0
 
@@ -247,14 +247,16 @@ class _Fit:
             if not start.undetermined:
                 faint = Faint.beside(decided.effects, self.states, shown[pixels.light], surface)
             relighting = Relighting(surface, self.caster, decided.effects, samples.views, faint)
-            samples = lit(samples, surface, self.caster, relighting.effects)
+            telling = relighting.lit(samples[pixels.light])
         with self.pace.stopwatch.stage("light"):
             wanted = {name: self.states.get(name, "auto") for name in ("coat", "tone")}
             if "specular" not in decided.effects:
                 wanted["coat"] = "off"
-            parts = samples[pixels.light], samples[pixels.white]
-            stage = LightStage(*parts, surface, start, self.pace, relighting, wanted, self.device, toned)
-            return _Lighted(decided, start, relighting, samples, stage.found())
+            parts = telling, samples[pixels.white]
+            found = before and before.found
+            stage = LightStage(*parts, surface, start, self.pace, relighting, wanted, self.device, found)
+            self.pace.leave(stage.cost.detail_s(self._weights, len(samples), self.pace.plan.steps))
+            return _Lighted(decided, start, relighting, stage.cost, stage.found())
 
     def detail(self, lighted: _Lighted, samples: Samples) -> tuple[State, np.ndarray, Remains | None]:
         """The state with finer features on top, normals [V, 3] tilted as the photos show, and what is left of
@@ -262,7 +264,7 @@ class _Fit:
         surface, pace, relighting = self.twin.surface, self.pace, lighted.relighting
         coarse, normals = lighted.found.state, surface.normals
         at_vertices = coarse.mean + coarse.operator.at(surface.vertices_mm, coarse.table)
-        finer = self._finer(samples, lighted.found.cost)
+        finer = self._finer(samples, lighted.cost)
         if finer is None:
             return State(None, at_vertices, None, coarse.shared), normals, None
         operator, samples = finer
@@ -294,21 +296,29 @@ class _Fit:
         Where there is no time for hash features, each vertex has a value of its own: those lack only what
         vertices learn from others.
         """
-        surface, pace = self.twin.surface, self.pace
-        finest_mm = pace.plan.detail * median_edge_mm(surface)
-        coarsest_mm = unit_mm(surface) * DETAIL_COARSEST_MM
-        grid = HashGrid(coarsest_mm, finest_mm, DETAIL_GROWTH)
-        setup_s = cost.setup_s * len(surface.vertices_mm) * len(grid.cells_mm) / cost.weights
-        left_s = pace.left(ITERATIONS)
-        if finest_mm > coarsest_mm or not pace.plan.steps or left_s <= cost.step_s / 2:
+        grid, points_mm = self._grid, self.twin.surface.vertices_mm
+        setup_s, left_s = cost.detail_s(self._weights, 0, 0), self.pace.left(ITERATIONS)
+        if grid.finest_mm > grid.coarsest_mm or not self.pace.plan.steps or left_s <= cost.step_s / 2:
             return None
-        if np.isfinite(left_s):
-            assembly_s = ASSEMBLY * (left_s - setup_s if left_s > 2 * setup_s else left_s)
-            count = int(cost.pixels * assembly_s / cost.step_s)
+        if self.pace.hurried:
+            sums_s = SUMS * (left_s - setup_s if left_s > 2 * setup_s else left_s)
+            count = int(cost.pixels * sums_s / cost.sums_s)
             samples = samples.thinned(count, np.random.default_rng(len(samples)))
         if left_s > 2 * setup_s:
-            return HashOperator.of(surface.vertices_mm, grid), samples
-        return HashOperator.each(len(surface.vertices_mm), finest_mm), samples
+            return HashOperator.of(points_mm, grid), samples
+        return HashOperator.each(len(points_mm), grid.finest_mm), samples
+
+    @property
+    def _grid(self) -> HashGrid:
+        """The cells of detail."""
+        surface = self.twin.surface
+        finest_mm = self.pace.plan.detail * median_edge_mm(surface)
+        return HashGrid(unit_mm(surface) * DETAIL_COARSEST_MM, finest_mm, DETAIL_GROWTH)
+
+    @property
+    def _weights(self) -> int:
+        """How many weights hash features as fine as the mesh have."""
+        return len(self.twin.surface.vertices_mm) * len(self._grid.cells_mm)
 
     def beyond(self, model: Model, samples: Samples) -> tuple[Found, list[Effect], dict[str, Decision]]:
         """What highlights show beyond the model, as far as there is time: the film, effects that are on, and

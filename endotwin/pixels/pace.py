@@ -15,7 +15,8 @@ from endotwin.run.stopwatch import Stopwatch
 
 GATHER, LIGHT, LIGHT_AGAIN, ITERATIONS = 0.2, 0.4, 0.7, 0.92
 """Shares of the budget after which no photo is read, no step looks for the light, nor, where a tone curve was
-found and taken off the photos, for the light beside it, and no iteration begins."""
+found and taken off the photos, for the light beside it, unless that leaves time for all of the detail, and no
+iteration begins."""
 
 PIXELS_A_SECOND = 100_000
 """Pixels a second of budget: more would leave no time to fit them."""
@@ -38,7 +39,12 @@ class Pace:
         self.stopwatch = Stopwatch()
         self.report = report or (lambda label, done, total: None)
         self.budget_s = plan.budget or math.inf
-        self._light = LIGHT
+        self._light, self._detail_s = LIGHT, math.inf
+
+    @property
+    def hurried(self) -> bool:
+        """Whether there is a budget."""
+        return math.isfinite(self.budget_s)
 
     @property
     def pixels(self) -> int:
@@ -55,12 +61,12 @@ class Pace:
 
     def share(self, frames: int, pixels: int) -> float:
         """Share of its pixels to take of each of ``frames`` photos with so many ``pixels`` each."""
-        least = PIXELS_A_PHOTO if math.isfinite(self.budget_s) else 0
+        least = PIXELS_A_PHOTO if self.hurried else 0
         return min(self.plan.pixels / frames, max(self.pixels / frames, least)) / max(1, pixels)
 
     def photos(self, frames: list[int]) -> Iterator[int]:
         """The frames to read: all in order, or evenly spread ones, at least one, while there is time."""
-        if not math.isfinite(self.budget_s):
+        if not self.hurried:
             yield from frames
             return
         for done, position in enumerate(spread_order(len(frames))):
@@ -75,11 +81,15 @@ class Pace:
     @property
     def light_left(self) -> float:
         """Seconds until the light's steps should end, at least 0."""
-        return self.left(self._light)
+        return max(self.left(self._light), self.left(ITERATIONS) - self._detail_s)
 
     def light_is_over(self) -> bool:
         """Whether the light's steps should end."""
         return not self.light_left
+
+    def leave(self, detail_s: float) -> None:
+        """The light may have what is left beside ``detail_s``, seconds of all steps of the detail."""
+        self._detail_s = detail_s
 
     def find_light_again(self) -> None:
         """What has been found of the light was found beside photos under a tone curve: there is more time."""
