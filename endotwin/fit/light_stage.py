@@ -76,20 +76,30 @@ class Cost:
 
     Attributes:
         setup_s, step_s: seconds of the operator and the solver, and of a step without the light.
-        weights: hash weights of its points. pixels: samples that the step went through, in ``sums_s`` of its
-        seconds.
+        solve_s: those of the step that do not depend on its pixels.
+        weights: hash weights of its points. pixels: samples that it went through.
     """
 
     setup_s: float
     step_s: float
+    solve_s: float
     weights: int
     pixels: int
-    sums_s: float
+
+    @property
+    def sums_s(self) -> float:
+        """Seconds of a step that went through the samples."""
+        return self.step_s - self.solve_s
+
+    def least_s(self, weights: int) -> float:
+        """Seconds of setting up, and of a step without pixels, with so many ``weights``."""
+        return (self.setup_s + self.solve_s) * weights / self.weights
 
     def detail_s(self, weights: int, pixels: int, steps: int) -> float:
         """Seconds of so many ``steps`` with more weights and pixels; rather too many, since some of what a
         step does with pixels takes no longer with more."""
-        return self.setup_s * weights / self.weights + steps * self.sums_s * pixels / self.pixels
+        solve_s = (steps - 1) * self.solve_s * weights / self.weights
+        return self.least_s(weights) + solve_s + steps * self.sums_s * pixels / self.pixels
 
 
 Toned = tuple[Tone, Decision]
@@ -168,8 +178,8 @@ class LightStage:
         ready = pace.stopwatch.total
         self._state, _ = self._stepped(self._state, joint=False)
         step_s = pace.stopwatch.total - ready
-        weights, sums_s = len(points) * len(operator.cells_mm), step_s - self._solver.solve_s
-        self.cost = Cost(set_up - began, step_s, weights, len(samples), sums_s)
+        weights = len(points) * len(operator.cells_mm)
+        self.cost = Cost(set_up - began, step_s, self._solver.solve_s, weights, len(samples))
 
     def found(self) -> FoundLight:
         """What is found; where that is a tone curve, as soon as it is."""

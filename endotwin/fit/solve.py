@@ -297,14 +297,14 @@ class _Fit:
         vertices learn from others.
         """
         grid, points_mm = self._grid, self.twin.surface.vertices_mm
-        setup_s, left_s = cost.detail_s(self._weights, 0, 0), self.pace.left(ITERATIONS)
+        least_s, left_s = cost.least_s(self._weights), self.pace.left(ITERATIONS)
         if grid.finest_mm > grid.coarsest_mm or not self.pace.plan.steps or left_s <= cost.step_s / 2:
             return None
         if self.pace.hurried:
-            sums_s = SUMS * (left_s - setup_s if left_s > 2 * setup_s else left_s)
+            sums_s = SUMS * (left_s - least_s if left_s > 2 * least_s else left_s)
             count = int(cost.pixels * sums_s / cost.sums_s)
             samples = samples.thinned(count, np.random.default_rng(len(samples)))
-        if left_s > 2 * setup_s:
+        if left_s > 2 * least_s:
             return HashOperator.of(points_mm, grid), samples
         return HashOperator.each(len(points_mm), grid.finest_mm), samples
 
