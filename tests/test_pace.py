@@ -8,6 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from endotwin.config import FitConfig
+from endotwin.fit.light_stage import Cost
 from endotwin.pixels.pace import ITERATIONS, Pace, spread_order
 
 
@@ -52,6 +53,13 @@ def test_light_may_take_all_that_the_detail_leaves_of_a_budget_but_never_has_les
     assert pace.light_left == pytest.approx(pace.left(ITERATIONS) - 20, abs=0.1)
     pace.leave(90)
     assert pace.light_left == pytest.approx(share, abs=1)
+
+
+def test_the_detail_costs_what_the_lights_step_did_by_its_weights_its_pixels_and_its_steps():
+    cost = Cost(setup_s=1, step_s=5, solve_s=2, weights=10, pixels=100)
+    assert cost.detail_s(weights=10, pixels=100, steps=1) == cost.setup_s + cost.step_s
+    assert cost.detail_s(weights=20, pixels=300, steps=2) == 2 * 1 + 2 * (2 * 2 + 3 * 3)
+    assert cost.least_s(weights=20) == cost.detail_s(weights=20, pixels=0, steps=1)
 
 
 def test_pixels_grow_with_the_budget_up_to_those_of_the_plan():
