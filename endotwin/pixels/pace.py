@@ -81,6 +81,8 @@ class Pace:
     @property
     def light_left(self) -> float:
         """Seconds until the light's steps should end, at least 0."""
+        if not self.hurried:
+            return math.inf
         return max(self.left(self._light), self.left(ITERATIONS) - self._detail_s)
 
     def light_is_over(self) -> bool:
