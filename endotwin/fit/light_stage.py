@@ -167,13 +167,14 @@ class LightStage:
             samples, triangles, operator, self._unit_mm, out_of_time=pace.light_is_over, device=device
         )
         set_up = pace.stopwatch.total
-        self._state = _started(operator, start, relighting, tone)
         self._near = (
             pace.hurried and before is not None and before.state.shared.bounces and relighting.bounces
         )
         if self._near:
             shared = replace(before.state.shared, tone=tone)
             self._state = replace(before.state, operator=operator, shared=shared)
+        else:
+            self._state = _started(operator, start, relighting, tone)
         relighting(self._solver, self._state)
         ready = pace.stopwatch.total
         self._state, _ = self._stepped(self._state, joint=False)
