@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from endotwin.pixels.fixed_effects import DENSE, Design, regress, without_means
+from endotwin.pixels.fixed_effects import DENSE, Design, FixedEffects, regress, robust_losses, without_means
 
 
 def made(count: int, groups: int, categories: int) -> tuple[np.ndarray, Design]:
@@ -55,3 +55,16 @@ def test_variation_within_groups_has_no_weighted_mean():
     within = without_means(design.columns, design.weight, design.group, design.count)
     sums = [np.bincount(design.group, design.weight * column, design.count) for column in within.T]
     np.testing.assert_allclose(sums, 0, atol=1e-12)
+
+
+def test_a_value_of_weight_4_loses_as_much_as_four_of_weight_1():
+    target, design = made(200, 10, 4)
+    weight = np.random.default_rng(1).integers(1, 5, len(target))
+    found = FixedEffects(np.array([0.9, -1.8, 0.4]), np.zeros(1), 0.0)
+    weighed = replace(design, category=None, weight=weight.astype(float))
+    each = np.repeat(np.arange(len(target)), weight)
+    repeated = replace(weighed, weight=None)[each]
+    wide = 1e3 * np.ptp(target)  # where losses are squares
+    lost = robust_losses(target, weighed, found, wide).sum()
+    assert lost == pytest.approx(robust_losses(target[each], repeated, found, wide).sum(), rel=1e-5)
+    assert lost > 1.1 * robust_losses(target, replace(weighed, weight=None), found, wide).sum()

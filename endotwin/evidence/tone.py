@@ -47,10 +47,10 @@ class Hues:
     slopes: np.ndarray
     weight: np.ndarray
 
-    def design(self, passing: int = TISSUE, curve: bool = True) -> Design:
-        """What may pass for a curve, as many of the first slopes, and, with a ``curve``, contrast; beside an
-        intercept a place."""
-        columns = [*range(passing), *([-1] if curve else [])]
+    def design(self, passing: int | None = None, curve: bool = True) -> Design:
+        """What may pass for a curve, as many of the first slopes (None: all), and, with a ``curve``, contrast;
+        beside an intercept a place."""
+        columns = [*range(self.slopes.shape[1] - 1)[:passing], *([-1] if curve else [])]
         place = np.unique(self.place, return_inverse=True)[1].reshape(-1)
         return Design(self.slopes[:, columns], place, int(place.max()) + 1, weight=self.weight)
 
@@ -58,8 +58,8 @@ class Hues:
 def judged(without: Callable[[Tone], Hues], wanted: str) -> tuple[Tone | None, Decision]:
     """The tone curve that the hues call for, or that is ``wanted`` (auto, on or off); and why.
 
-    Where light bounces they have to call for one beside a bounce of any strength, too: what the bounce
-    lacks turns hues as well.
+    Where light bounces they have to call for one beside a bounce of any strength, too, and it is that one:
+    what the bounce errs by turns hues as well.
 
     Args:
         without: the hues, by the curve that is taken off.
@@ -68,7 +68,7 @@ def judged(without: Callable[[Tone], Hues], wanted: str) -> tuple[Tone | None, D
         return None, Decision("off", "forced off")
     began = time.perf_counter()
     trials = _trials(without)
-    tone, verdict = trials[0]
+    tone, verdict = trials[-1]
     told = " and, beside a bounce of any strength, ".join(
         f"a contrast of {curve.contrast:.2f} predicts held-out hues better by {each}"
         for curve, each in trials
@@ -88,8 +88,10 @@ def _trials(without: Callable[[Tone], Hues]) -> list[tuple[Tone, Verdict]]:
     return [(steadied(Tone(), without, each), _verdict(plain, each)) for each in passing]
 
 
-def steadied(tone: Tone, without: Callable[[Tone], Hues], passing: int = TISSUE) -> Tone:
-    """The curve without which the hue of each place is steadiest, sought from ``tone``."""
+def steadied(tone: Tone, without: Callable[[Tone], Hues], passing: int | None = None) -> Tone:
+    """The curve without which the hue of each place is steadiest, sought from ``tone``, beside as many as are
+    ``passing`` of what may pass for one, or all of it: a curve that was sought beside the bounce as it is,
+    and a bounce beside that curve, would drive each other on."""
     (contrast,) = Tone.parameters()
     for _ in range(ROUNDS):
         hues = without(tone)
@@ -100,6 +102,11 @@ def steadied(tone: Tone, without: Callable[[Tone], Hues], passing: int = TISSUE)
         if abs(tone.contrast - before.contrast) < SETTLED:
             break
     return tone
+
+
+def faded(tone: Tone) -> Decision:
+    """On a curve of which the light that was found beside it has left next to nothing."""
+    return Decision("off", f"none that counts beside the light: a contrast of {tone.contrast:.2f} is left")
 
 
 def _verdict(hues: Hues, passing: int) -> Verdict:

@@ -16,7 +16,7 @@ import torch
 from endotwin.effects import Decision, Effects
 from endotwin.effects.tone import Tone
 from endotwin.evidence.coat import judged as judged_coat
-from endotwin.evidence.tone import Hues, steadied
+from endotwin.evidence.tone import LEAST_CONTRAST, Hues, faded, steadied
 from endotwin.evidence.tone import judged as judged_tone
 from endotwin.fit.faint import Faint
 from endotwin.fit.gauss_newton import GaussNewton
@@ -340,10 +340,13 @@ class LightStage:
 
     def _judged(self, number: int, step: int) -> Globals:
         """Light and response as they are, with the tone curve that is right beside them, and the coat, which
-        is judged in the ``step``."""
+        is judged in the ``step``; so is whether the curve still counts."""
         shared = self._state.shared
-        if shared.tone is not None and number >= step:
+        if shared.tone is not None and number:
             shared = replace(shared, tone=steadied(shared.tone, self._hues()))
+            forced = self._wanted["tone"] == "on"
+            if number >= step and not forced and shared.tone.contrast < LEAST_CONTRAST:
+                shared, self._decisions["tone"] = replace(shared, tone=None), faded(shared.tone)
             self._state = replace(self._state, shared=shared)
         if "coat" not in self._decisions and number >= (0 if self._wanted["coat"] == "on" else step):
             shared = self._coated()

@@ -130,10 +130,11 @@ def _shared(weight: np.ndarray, design: Design, categories: int) -> np.ndarray |
 
 
 def robust_residuals(target: np.ndarray, design: Design, found: FixedEffects, width: float) -> np.ndarray:
-    """What is left [N] beside what was ``found``, each group at its own mean, in units of ``width``;
-    shortened so that half its square is the pseudo-Huber loss."""
+    """What is left [N] beside what was ``found``, each group at its own mean, in units of ``width``, that of
+    values of weight 1; shortened so that half its square is the pseudo-Huber loss."""
     left = (target - design.explained(found))[:, None]
-    residual = without_means(left, np.ones(len(target)), design.group, design.count)[:, 0] / width
+    trust = np.ones(len(target)) if design.weight is None else design.weight
+    residual = without_means(left, trust, design.group, design.count)[:, 0] * np.sqrt(trust) / width
     return np.sign(residual) * np.sqrt(2 * pseudo_huber(residual))
 
 

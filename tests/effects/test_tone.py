@@ -91,9 +91,12 @@ def beside_a_bounce(contrast: float, strength: float = 0.0):
     return without
 
 
-def test_a_curve_is_found_beside_a_bounce_that_turns_hues_nearly_as_it_does():
-    tone, decision = judged(beside_a_bounce(0.3), "auto")
+@pytest.mark.parametrize("strength", [0.0, 0.2])
+def test_a_curve_is_found_beside_a_bounce_that_turns_hues_nearly_as_it_does_whatever_its_strength(strength):
+    hues = beside_a_bounce(0.3, strength)
+    tone, decision = judged(hues, "auto")
     assert decision.state == "on" and tone.contrast == pytest.approx(0.3, abs=0.03)
+    assert steadied(Tone(0.1), hues).contrast == pytest.approx(0.3, abs=0.03)
 
 
 def test_a_bounce_of_another_strength_is_no_curve():
