@@ -9,13 +9,14 @@ import tube_twin
 
 from endotwin.effects import Effects
 from endotwin.effects.gain import Gain
+from endotwin.effects.interreflection import Interreflection
 from endotwin.effects.offset import Offset
 from endotwin.effects.shadows import Shadows
 from endotwin.effects.specular import Specular
 from endotwin.fit.gauss_newton import GaussNewton
 from endotwin.fit.light_stage import STEPS
-from endotwin.fit.lighting import Relighting, lit
-from endotwin.fit.model import at_pixels
+from endotwin.fit.lighting import Bouncer, Relighting, lit
+from endotwin.fit.model import Globals, at_pixels
 from endotwin.fit.within import Within
 from endotwin.light.bounced import Bounce
 from endotwin.surface.casting import Caster
@@ -104,6 +105,38 @@ def test_guides_that_cast_shadows_stay_where_those_told():
     effects = Effects([Specular(), Offset(((2.0, -1.0, 0.0),)), Shadows()])
     samples = tube_twin.photographed(twin, tube_twin.CAMERA, tube_twin.pose(0.5)[None])
     assert Relighting(twin.surface, Caster(twin.surface), effects, samples.views).varied.guides == 0
+
+
+class Interrupted(Bouncer):
+    """Lets ``meanwhile`` be done once, as soon as it has noted anything, as another thread may."""
+
+    meanwhile = None
+
+    def __setattr__(self, name, value):
+        super().__setattr__(name, value)
+        if name != "meanwhile" and self.meanwhile is not None:
+            meanwhile, self.meanwhile = self.meanwhile, None
+            meanwhile()
+
+
+def test_a_photo_that_is_lit_while_another_is_gets_the_light_that_it_gets_alone(exposed_unevenly):
+    twin, samples, state = exposed_unevenly
+    shared = Globals.of(twin.light, twin.response, 0.04, bounce=True)
+    effects = Effects([Specular(), Interreflection(2.0)])
+    triangles = torch.from_numpy(twin.surface.triangles.astype(np.int64))
+    one, other = (samples[samples.frame == frame] for frame in samples.views.frames[:2])
+    assert len(one) != len(other)
+    bouncer = Interrupted(twin.surface, Caster(twin.surface), effects, samples.views)
+
+    def bounced(photo):
+        roughness = at_pixels(photo, triangles, state.materials[:, 3:])[:, 0]
+        return bouncer.bounced(photo, roughness, state.materials, triangles, shared).bounce.log
+
+    alone = bounced(one)
+    bounced(other)
+    bouncer.meanwhile = lambda: bounced(other)
+    torch.testing.assert_close(bounced(one), alone)
+    assert bouncer.meanwhile is None
 
 
 @pytest.mark.parametrize("alike", [True, False])

@@ -48,8 +48,8 @@ class Hues:
     weight: np.ndarray
 
     def design(self, passing: int | None = None, curve: bool = True) -> Design:
-        """What may pass for a curve, as many of the first slopes (None: all), and, with a ``curve``, contrast;
-        beside an intercept a place."""
+        """What may pass for a curve, as many of the first slopes (None: all), and, with a ``curve``,
+        contrast; beside an intercept a place."""
         columns = [*range(self.slopes.shape[1] - 1)[:passing], *([-1] if curve else [])]
         place = np.unique(self.place, return_inverse=True)[1].reshape(-1)
         return Design(self.slopes[:, columns], place, int(place.max()) + 1, weight=self.weight)

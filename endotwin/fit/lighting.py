@@ -241,14 +241,16 @@ class Bouncer:
         return replace(samples, bounce=replace(bounce, shown=shown))
 
     def _places(self, samples: Samples, shine: bool) -> Places:
-        """Where the samples lie, and what they mirror if they ``shine``; kept for the steps that follow."""
-        if self._placed[0] is not samples.pixel:
+        """Where the samples lie, and what they mirror if they ``shine``; kept for the steps that follow, of
+        the samples that any thread asked for last."""
+        pixel, places = self._placed
+        if pixel is not samples.pixel:
             to_vertex, triangles = self._radiosity.to_vertex, self._surface.triangles
             view = samples.views.row(samples.frame)
             mirrored = self._mirrored(samples, view) if shine else None
             places = Places(to_vertex[samples.nearest(triangles)], view, mirrored)
             self._placed = samples.pixel, places
-        return self._placed[1]
+        return places
 
     def _mirrored(self, samples: Samples, view: np.ndarray) -> scipy.sparse.csr_array:
         """CSR [N, P], from patches to what each sample mirrors to its camera."""
