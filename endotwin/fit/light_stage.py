@@ -187,6 +187,7 @@ class LightStage:
         toned = self._in_one_step() if self._relighting.bounces else None
         if not self._relighting.bounces:
             toned = self._in_turns()
+        self._without_faded()
         hurried = Decision("off", "no time to judge")
         decisions = dict.fromkeys(self._wanted, hurried) | self._decisions
         return FoundLight(self._state, decisions, toned)
@@ -286,6 +287,15 @@ class LightStage:
         else:
             self._state, _ = self._stepped(self._state, joint=False)
 
+    def _without_faded(self) -> None:
+        """No tone curve, if the light that was found beside one has left next to nothing of it."""
+        shared = self._state.shared
+        tone = shared.tone
+        if tone is None or tone.contrast >= LEAST_CONTRAST or self._wanted["tone"] == "on":
+            return
+        self._decisions["tone"] = faded(tone)
+        self._state = replace(self._state, shared=replace(shared, tone=None))
+
     def _renew(self, shared: Globals, held: tuple[str, ...], noise: float) -> None:
         """Light and response, from ``shared``, and what may vary with them, by what varies within vertices.
         Where no endoscope has what would be faint, nothing is."""
@@ -340,13 +350,10 @@ class LightStage:
 
     def _judged(self, number: int, step: int) -> Globals:
         """Light and response as they are, with the tone curve that is right beside them, and the coat, which
-        is judged in the ``step``; so is whether the curve still counts."""
+        is judged in the ``step``."""
         shared = self._state.shared
         if shared.tone is not None and number:
             shared = replace(shared, tone=steadied(shared.tone, self._hues()))
-            forced = self._wanted["tone"] == "on"
-            if number >= step and not forced and shared.tone.contrast < LEAST_CONTRAST:
-                shared, self._decisions["tone"] = replace(shared, tone=None), faded(shared.tone)
             self._state = replace(self._state, shared=shared)
         if "coat" not in self._decisions and number >= (0 if self._wanted["coat"] == "on" else step):
             shared = self._coated()
