@@ -26,11 +26,6 @@ ROUNDS, SETTLED = 4, 0.002
 TISSUE = 2
 """Slopes by what whitens: f0 and roughness."""
 
-TOLD = 0.1
-"""That the bounce is as strong as pixels say, is told by this share of what hues alone say of it. With none
-of it what bounces err by from place to place bends the curve, with all what they err by everywhere; this bent
-the response of fifteen scenes least."""
-
 LEAST_CONTRAST = 0.1
 """Less is none: it changes values by 2.5 of 255 levels at most, and beside bounced light hues are known no
 better."""
@@ -52,13 +47,12 @@ class Hues:
     slopes: np.ndarray
     weight: np.ndarray
 
-    def design(self, passing: int, curve: bool = True, told: float = 0.0) -> Design:
+    def design(self, passing: int = TISSUE, curve: bool = True) -> Design:
         """What may pass for a curve, as many of the first slopes, and, with a ``curve``, contrast; beside an
-        intercept a place. That the bounce is as strong as it is, is ``told`` by so much of what hues say."""
+        intercept a place."""
         columns = [*range(passing), *([-1] if curve else [])]
         place = np.unique(self.place, return_inverse=True)[1].reshape(-1)
-        ridge = np.where(np.isin(columns, range(TISSUE, passing)), told, 0.0)
-        return Design(self.slopes[:, columns], place, int(place.max()) + 1, weight=self.weight, ridge=ridge)
+        return Design(self.slopes[:, columns], place, int(place.max()) + 1, weight=self.weight)
 
 
 def judged(without: Callable[[Tone], Hues], wanted: str) -> tuple[Tone | None, Decision]:
@@ -74,7 +68,7 @@ def judged(without: Callable[[Tone], Hues], wanted: str) -> tuple[Tone | None, D
         return None, Decision("off", "forced off")
     began = time.perf_counter()
     trials = _trials(without)
-    verdict = trials[0][1]
+    tone, verdict = trials[0]
     told = " and, beside a bounce of any strength, ".join(
         f"a contrast of {curve.contrast:.2f} predicts held-out hues better by {each}"
         for curve, each in trials
@@ -84,39 +78,28 @@ def judged(without: Callable[[Tone], Hues], wanted: str) -> tuple[Tone | None, D
     if wanted == "auto" and not sure:
         return None, Decision("off", f"none that counts: {told}", gain_db, took_s)
     forced = "forced on; " if wanted == "on" else ""
-    return steadied(Tone(), without), Decision("on", forced + told, gain_db, took_s)
+    return tone, Decision("on", forced + told, gain_db, took_s)
 
 
 def _trials(without: Callable[[Tone], Hues]) -> list[tuple[Tone, Verdict]]:
     """The curve and what it is worth; then, where light bounces, the same beside a bounce of any strength."""
     plain = without(Tone())
     passing = range(TISSUE, plain.slopes.shape[1])
-    return [(steadied(Tone(), without, each, told=0.0), _verdict(plain, each)) for each in passing]
+    return [(steadied(Tone(), without, each), _verdict(plain, each)) for each in passing]
 
 
-def steadied(
-    tone: Tone, without: Callable[[Tone], Hues], passing: int | None = None, told: float = TOLD
-) -> Tone:
-    """The curve without which the hue of each place is steadiest, sought from ``tone``, beside as many as are
-    ``passing`` of what may pass for one (None: all) and a bounce that is as strong as it is ``told``. Beside
-    the bounce as it is the curve, and beside that curve the bounce, would drive each other on."""
+def steadied(tone: Tone, without: Callable[[Tone], Hues], passing: int = TISSUE) -> Tone:
+    """The curve without which the hue of each place is steadiest, sought from ``tone``."""
     (contrast,) = Tone.parameters()
     for _ in range(ROUNDS):
         hues = without(tone)
         if len(hues.residual) < LEAST_SIGHTINGS:
             return tone
-        every = hues.slopes.shape[1] - 1
-        design = hues.design(every if passing is None else passing, told=told)
-        more = float(regress(hues.residual, design).coefficients[-1])
+        more = float(regress(hues.residual, hues.design(passing)).coefficients[-1])
         before, tone = tone, Tone(float(np.clip(tone.contrast + more, contrast.low, contrast.high)))
         if abs(tone.contrast - before.contrast) < SETTLED:
             break
     return tone
-
-
-def faded(tone: Tone) -> Decision:
-    """On a curve of which the light that was found beside it has left next to nothing."""
-    return Decision("off", f"none that counts beside the light: a contrast of {tone.contrast:.2f} is left")
 
 
 def _verdict(hues: Hues, passing: int) -> Verdict:

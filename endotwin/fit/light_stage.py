@@ -16,7 +16,7 @@ import torch
 from endotwin.effects import Decision, Effects
 from endotwin.effects.tone import Tone
 from endotwin.evidence.coat import judged as judged_coat
-from endotwin.evidence.tone import LEAST_CONTRAST, Hues, faded, steadied
+from endotwin.evidence.tone import Hues, steadied
 from endotwin.evidence.tone import judged as judged_tone
 from endotwin.fit.faint import Faint
 from endotwin.fit.gauss_newton import GaussNewton
@@ -187,7 +187,6 @@ class LightStage:
         toned = self._in_one_step() if self._relighting.bounces else None
         if not self._relighting.bounces:
             toned = self._in_turns()
-        self._without_faded()
         hurried = Decision("off", "no time to judge")
         decisions = dict.fromkeys(self._wanted, hurried) | self._decisions
         return FoundLight(self._state, decisions, toned)
@@ -287,15 +286,6 @@ class LightStage:
         else:
             self._state, _ = self._stepped(self._state, joint=False)
 
-    def _without_faded(self) -> None:
-        """No tone curve, if the light that was found beside one has left next to nothing of it."""
-        shared = self._state.shared
-        tone = shared.tone
-        if tone is None or tone.contrast >= LEAST_CONTRAST or self._wanted["tone"] == "on":
-            return
-        self._decisions["tone"] = faded(tone)
-        self._state = replace(self._state, shared=replace(shared, tone=None))
-
     def _renew(self, shared: Globals, held: tuple[str, ...], noise: float) -> None:
         """Light and response, from ``shared``, and what may vary with them, by what varies within vertices.
         Where no endoscope has what would be faint, nothing is."""
@@ -352,7 +342,7 @@ class LightStage:
         """Light and response as they are, with the tone curve that is right beside them, and the coat, which
         is judged in the ``step``."""
         shared = self._state.shared
-        if shared.tone is not None and number:
+        if shared.tone is not None and number >= step:
             shared = replace(shared, tone=steadied(shared.tone, self._hues()))
             self._state = replace(self._state, shared=shared)
         if "coat" not in self._decisions and number >= (0 if self._wanted["coat"] == "on" else step):
