@@ -47,6 +47,11 @@ class Design:
         columns, group = self.columns[rows], self.group[rows]
         return Design(columns, group, self.count, category, weight, self.prior, self.ridge)
 
+    @property
+    def trust(self) -> np.ndarray:
+        """The weights [N], 1 where all are alike."""
+        return np.ones(len(self.columns)) if self.weight is None else self.weight
+
     def explained(self, found: FixedEffects) -> np.ndarray:
         """The values [N] without the groups' intercepts."""
         values = self.columns @ found.coefficients
@@ -74,7 +79,7 @@ def without_means(values: np.ndarray, weight: np.ndarray, group: np.ndarray, cou
 
 def regress(target: np.ndarray, design: Design, categories: int = 0, rounds: int = REWEIGHTS) -> FixedEffects:
     """Huber regression (iteratively reweighted) of ``target`` [N]; ``categories`` is their number."""
-    trust = np.ones(len(target)) if design.weight is None else design.weight
+    trust = design.trust
     weight, width = trust, 1.0
     group, count, slopes = design.group, design.count, design.columns.shape[1]
     for _ in range(rounds):
@@ -132,8 +137,7 @@ def _shared(weight: np.ndarray, design: Design, categories: int) -> np.ndarray |
 def robust_residuals(target: np.ndarray, design: Design, found: FixedEffects, width: float) -> np.ndarray:
     """What is left [N] beside what was ``found``, each group at its own mean, in units of ``width``, that of
     values of weight 1; shortened so that half its square is the pseudo-Huber loss."""
-    left = (target - design.explained(found))[:, None]
-    trust = np.ones(len(target)) if design.weight is None else design.weight
+    left, trust = (target - design.explained(found))[:, None], design.trust
     residual = without_means(left, trust, design.group, design.count)[:, 0] * np.sqrt(trust) / width
     return np.sign(residual) * np.sqrt(2 * pseudo_huber(residual))
 
