@@ -6,9 +6,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+import tube_twin
 
-from endotwin.fit.gauss_newton import unusual
-from endotwin.fit.model import Globals
+from endotwin.effects import Effects
+from endotwin.effects.interreflection import Interreflection
+from endotwin.effects.specular import Specular
+from endotwin.fit.gauss_newton import BOUNCE_ERROR, STANDARD_SPREAD, TEMPER, GaussNewton, unusual
+from endotwin.fit.lighting import Relighting, lit
+from endotwin.fit.model import Globals, at_pixels, predict
 from endotwin.fit.state import (
     BRIGHTEST,
     DARKEST,
@@ -21,6 +26,7 @@ from endotwin.fit.state import (
     too_dark,
     without_furnace,
 )
+from endotwin.surface.casting import Caster
 from endotwin.twin import Light, Response
 
 
@@ -84,3 +90,39 @@ def test_tissue_is_too_dark_by_what_it_reflects_not_by_its_scale():
     for factor in (0.2, 0.8, 1.6):
         assert too_dark(colored(factor, math.log(0.9 * DARKEST / factor)))
         assert not too_dark(colored(factor, math.log(1.2 * DARKEST / factor)))
+
+
+def explained(gamma: float, bounces: bool) -> tuple[GaussNewton, State]:
+    """A tube under a response of ``gamma``, and photos of it that show just what is predicted."""
+    twin = tube_twin.fitted(tube_twin.seen(tube_twin.surface()))
+    samples = tube_twin.photographed(twin, tube_twin.CAMERA, tube_twin.pose(0.5)[None])
+    effects = Effects([Specular(), *([Interreflection(4.0)] * bounces)])
+    shared = Globals.of(twin.light, Response(gamma), twin.materials.f0, bounce=bounces)
+    state = replace(tube_twin.state_of(twin), shared=shared)
+    relighting = Relighting(twin.surface, Caster(twin.surface), effects, samples.views)
+    samples = lit(samples, twin.surface, Caster(twin.surface), effects)
+    solver = GaussNewton(samples, twin.surface.triangles, state.operator)
+    relighting(solver, state)
+    material = at_pixels(solver.samples, solver.triangles, state.materials)
+    shown = (255 * predict(solver.samples, material, shared).clamp(0, 1) + 0.5).to(torch.uint8)
+    solver.relight(replace(solver.samples, color=shown))
+    return solver, state
+
+
+@pytest.mark.parametrize("bounces", [False, True])
+def test_a_response_off_the_displays_costs_an_error_of_a_level_a_deviation_where_light_bounces(
+    monkeypatch, bounces
+):
+    solver, state = explained(0.4, bounces)
+    noise = 2 / 255
+    cost = solver.cost(state, noise)
+    monkeypatch.setattr("endotwin.fit.gauss_newton.BOUNCE_ERROR", 0.0)
+    deviations = (0.4 - 1 / 2.2) / STANDARD_SPREAD
+    expected = bounces * len(solver.samples) * (deviations * BOUNCE_ERROR / noise) ** 2 / (2 * TEMPER)
+    assert cost - solver.cost(state, noise) == pytest.approx(expected, rel=1e-6)
+
+
+def test_a_step_goes_to_where_that_cost_falls():
+    solver, state = explained(0.4, bounces=True)
+    found = solver.step(state)
+    assert found.fell > 0 and 0.402 < found.state.shared.gamma < 1 / 2.2

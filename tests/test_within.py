@@ -252,29 +252,53 @@ def test_under_a_coat_that_shines_a_clipped_photo_says_at_least():
     assert not len(seen(0.5, 1e9))
 
 
-def test_beside_a_bounce_colours_tell_the_response_where_gains_swallow_all_that_is_grey():
-    """All of a frame is lit alike, so that its gain passes for its light; only how red that is remains."""
+def told_by_colours(true: Globals, lacking: float = 0.0) -> tuple[float, np.ndarray, np.ndarray]:
+    """γ and the gains that are found where all of a frame is lit alike, so that its gain passes for its light
+    and only how red that is remains; and the true gains. The bounce that is known is the true one to the
+    power of 1 + ``lacking``."""
     generator = np.random.default_rng(4)
     within, material = photographed()
     frame, count = within.samples.frame.long(), len(within.samples)
     material[:, :3] = material[:, :3].clamp_max(0.5)
     tint = torch.tensor([0.6, 0.25, 0.15]) * torch.from_numpy(generator.uniform(0.05, 1, (SIGHTINGS, 1)))
-    log = torch.log(tint)[frame] - 2.2 * np.log(20.0)
-    none = torch.zeros(count)
-    bounce = Bounce(log, none, none, torch.ones(count, 3), torch.zeros(count, 3), none)
+    log, none = torch.log(tint)[frame], torch.zeros(count)
+    bounces = [
+        Bounce(each - 2.2 * np.log(20.0), none, none, torch.ones(count, 3), torch.zeros(count, 3), none)
+        for each in (log, (1 + lacking) * log)
+    ]
     gain = torch.from_numpy(generator.normal(0, 0.2, SIGHTINGS))
     even = {"cos": 0.5 + none, "sin2": 0.75 + none, "log_cos_axis": -0.2 + none}
-    samples = replace(within.samples, **even, log_distance=np.log(20.0) + none, bounce=bounce, views=VIEWS)
-    samples = recorded(replace(samples, log_exposure=gain[frame]), material, BOUNCING, generator)
-    log_L0, n, q = BOUNCING.log_light
+    samples = replace(
+        within.samples, **even, log_distance=np.log(20.0) + none, bounce=bounces[0], views=VIEWS
+    )
+    samples = recorded(replace(samples, log_exposure=gain[frame]), material, true, generator)
+    samples = replace(samples, bounce=bounces[1])
+    log_L0, n, q = true.log_light
     start = Globals.of(Light(math.exp(log_L0), n, q), Response(0.5), f0=0.035, bounce=True)
     exposure = torch.zeros(SIGHTINGS, dtype=torch.float64)
     for _ in range(8):
         lit = replace(within, samples=replace(samples, log_exposure=exposure[frame]))
         found = lit.renewed(material, start, ("n", "q", "albedo scale"), NOISE, Varied(SIGHTINGS))
         start, exposure = found.shared, exposure + torch.from_numpy(found.log_gain)
-    assert start.gamma == pytest.approx(BOUNCING.gamma, rel=0.02)
-    np.testing.assert_allclose(exposure - exposure.mean(), gain - gain.mean(), atol=0.02)
+    return start.gamma, (exposure - exposure.mean()).numpy(), (gain - gain.mean()).numpy()
+
+
+def test_beside_a_bounce_known_exactly_colours_tell_the_response_where_gains_swallow_all_that_is_grey(
+    monkeypatch,
+):
+    monkeypatch.setattr("endotwin.fit.within.BOUNCE_ERROR", 0.0)
+    gamma, found, gain = told_by_colours(BOUNCING)
+    assert gamma == pytest.approx(BOUNCING.gamma, rel=0.02)
+    np.testing.assert_allclose(found, gain, atol=0.02)
+
+
+def test_what_the_bounce_lacks_bends_a_usual_response_by_less_than_half_of_what_photos_say(monkeypatch):
+    usual = Globals.of(Light(120.0, 1.7, 2.2), Response(1 / 2.2), f0=0.035, bounce=True)
+    held = abs(told_by_colours(usual, lacking=0.1)[0] - usual.gamma)
+    monkeypatch.setattr("endotwin.fit.within.BOUNCE_ERROR", 0.0)
+    bent = abs(told_by_colours(usual, lacking=0.1)[0] - usual.gamma)
+    assert bent > 0.04 * usual.gamma
+    assert held < bent / 2
 
 
 def test_beside_a_bounce_highlights_follow_the_light():

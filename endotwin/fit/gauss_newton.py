@@ -56,17 +56,21 @@ AT_EDGE = 0.01
 """Beyond so many standard deviations of the prior, and so near an edge of their range in shares of one, n, q
 and γ are no endoscope's."""
 
-F0 = GLOBALS.index("ln f0")
-
+GAMMA, F0 = (GLOBALS.index(name) for name in ("gamma", "ln f0"))
 
 CG_TOLERANCE = 1e-3
 CG_STEPS = 25
 SEARCH_SAMPLES = 300_000
 
-DAMPING = 1 / 255
-"""Where light bounces, a step of light, response or the albedo's scale by one standard deviation of their
-prior must explain so much of the photos, as root mean square in display values: what it does to bounced light
-is known to first order only."""
+BOUNCE_ERROR = 1 / 255
+"""Of display values where light bounces, root mean square and alike in many pixels: much of it comes from
+tissue that nobody saw, and what a step does to it is known to first order. A step of light, response or the
+albedo's scale by one standard deviation of their prior must explain as much."""
+
+STANDARD_SPREAD = 0.05
+"""Standard deviation among cameras of γ about that of displays: the curves of sRGB, BT.709 and BT.1886 are
+nearly powers of 0.45, 0.51 and 0.42. Where light bounces few levels tell γ from it, and what the model lacks
+bends γ instead: one that far off must explain BOUNCE_ERROR, too."""
 
 MOST_BRIGHTER = 0.5
 """Of the logarithm of bounced light, by a step of the albedo's scale: it grows faster than that."""
@@ -166,12 +170,18 @@ class GaussNewton:
         return self._cost(self._here(state), noise)
 
     def _cost(self, state: State, noise: float, log_gain: np.ndarray = _NO_GAINS) -> float:
-        share = len(self.samples) / max(1, len(self._trial))
+        share, scale = len(self.samples) / max(1, len(self._trial)), 1 / (noise**2 * TEMPER)
         predicted = self._predict(state, log_gain)
-        data = robust_cost(self._trial, predicted, HUBER * noise) * share / (noise**2 * TEMPER)
+        data = robust_cost(self._trial, predicted, HUBER * noise) * share * scale
         prior = float((self.precision * state.table**2).double().sum()) / 2
         mean, spread = self._global_prior(state)
-        return data + prior + float((((state.shared.vector - mean) / spread) ** 2).sum()) / 2
+        off = state.shared.vector - mean
+        bent = self._errors(state, scale) * (off[GAMMA] / STANDARD_SPREAD) ** 2
+        return data + prior + float(((off / spread) ** 2).sum() + bent) / 2
+
+    def _errors(self, state: State, scale: float) -> float:
+        """What BOUNCE_ERROR in all pixels counts as, 0 where no light bounces; ``scale``: a pixel's."""
+        return len(self.samples) * scale * BOUNCE_ERROR**2 if state.shared.bounces else 0.0
 
     def step(self, state: State, joint: bool = True, gains: bool = False) -> Step:
         """One Gauss–Newton step with a backtracking line search.
@@ -196,14 +206,13 @@ class GaussNewton:
             self._frames if gains else None,
         )
         free = free_directions(state.shared, self.held) if joint else np.zeros((len(state.shared.vector), 0))
-        damping = len(self.samples) * scale * DAMPING**2 if state.shared.bounces else 0.0
         began = time.perf_counter()
-        table_step, shared_step = self._solve(state, equations, scale, free, damping)
+        table_step, shared_step = self._solve(state, equations, scale, free)
         self.solve_s = time.perf_counter() - began
         room = room_below_furnace(state, float(shared_step[-1])) if joint and state.shared.bounces else 1.0
         if room < LENGTHS[-1]:
             room, free = 1.0, free_directions(state.shared, (*self.held, "albedo scale"))
-            table_step, shared_step = self._solve(state, equations, scale, free, damping)
+            table_step, shared_step = self._solve(state, equations, scale, free)
         trusted = float((self._global_prior(state)[1] / shared_step.abs().clamp_min(1e-12)).min())
         if joint and state.shared.bounces:
             brighter = float(shared_step[-1].abs() * self._trial.bounce.by_scale.mean())
@@ -250,7 +259,7 @@ class GaussNewton:
         return predict(samples, at_pixels(samples, self._triangles, state.materials), state.shared)
 
     def _solve(
-        self, state: State, equations: NormalEquations, scale: float, free: np.ndarray, damping: float
+        self, state: State, equations: NormalEquations, scale: float, free: np.ndarray
     ) -> tuple[Tensor, Tensor]:
         link = state.link_slope[..., None]
         mean, spread = self._global_prior(state)
@@ -275,9 +284,11 @@ class GaussNewton:
 
         if not joint:
             return solved[..., 0], torch.zeros_like(spread)
-        pull = ((mean - state.shared.vector) / spread**2).numpy()
-        damped = np.where(np.arange(len(spread)) == F0, 1, 1 + damping)
-        shared_normal = equations.shared * scale + np.diag(damped / spread.numpy() ** 2)
+        errors, known = self._errors(state, scale), 1 / spread.numpy() ** 2
+        damping = errors * np.where(np.arange(len(known)) == F0, 0, known)
+        known[GAMMA] += errors / STANDARD_SPREAD**2
+        pull = known * (mean - state.shared.vector).numpy()
+        shared_normal = equations.shared * scale + np.diag(known + damping)
         shared_right = free.T @ (equations.shared_right * scale + pull)
         weights, along = _joint_minimum(
             solved, product(solved), right, free.T @ shared_normal @ free, shared_right

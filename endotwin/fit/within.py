@@ -28,7 +28,16 @@ from endotwin.effects.tone import Tone, bend
 from endotwin.evidence.coat import LEAST_SIGHTINGS, Highlights
 from endotwin.evidence.tone import Hues
 from endotwin.fit.faint import NOTHING, Faint
-from endotwin.fit.gauss_newton import F0, ROUGHNESS_LOGIT_SPREAD, TEMPER, free_directions, global_prior
+from endotwin.fit.gauss_newton import (
+    BOUNCE_ERROR,
+    F0,
+    GAMMA,
+    ROUGHNESS_LOGIT_SPREAD,
+    STANDARD_SPREAD,
+    TEMPER,
+    free_directions,
+    global_prior,
+)
 from endotwin.fit.model import BOUNCE_GLOBALS, Globals, linearise, predict
 from endotwin.fit.state import bounded, roughness_slope
 from endotwin.light import shading
@@ -281,8 +290,12 @@ class Within:
         mean, spread = (x.numpy() for x in global_prior(self.unit_mm, len(shared.vector)))
         known = np.zeros(seen.by_varied.shape[1])
         known[: 3 * varied.guides] = TEMPER / (ASIDE_SPREAD * self.distance_mm) ** 2
-        parts = [free.T @ np.diag(TEMPER / spread**2) @ free, np.diag(known)]
-        pulls = [free.T @ (TEMPER * (mean - shared.vector.numpy()) / spread**2), 0 * known]
+        sure = TEMPER / spread**2
+        if shared.bounces:
+            told = float(seen.weight[seen.vertex < self.count].sum())
+            sure[GAMMA] += told * (BOUNCE_ERROR / self._shown / STANDARD_SPREAD) ** 2
+        parts = [free.T @ np.diag(sure) @ free, np.diag(known)]
+        pulls = [free.T @ (sure * (mean - shared.vector.numpy())), 0 * known]
         columns = [seen.slopes @ free, seen.by_varied]
         if diffuse or coated:
             columns.append(seen.by_roughness[:, None])
@@ -293,6 +306,11 @@ class Within:
             parts.append([[TEMPER / COAT_SPREAD**2]])
             pulls.append([-TEMPER * shared.coat.weight / COAT_SPREAD**2])
         return np.hstack(columns), (scipy.linalg.block_diag(*parts), np.concatenate(pulls))
+
+    @property
+    def _shown(self) -> float:
+        """Mean display value."""
+        return float(self.samples.color.float().mean()) / 255
 
     @property
     def distance_mm(self) -> float:
