@@ -37,7 +37,7 @@ from endotwin.pixels.length_unit import unit_mm
 from endotwin.pixels.pace import ITERATIONS, Pace
 from endotwin.pixels.samples import Samples, Views, drawn, gather, whole_groups
 from endotwin.pixels.start import ALBEDO_TOP, BRIGHT, Start, closed_form, start_at
-from endotwin.run.threads import THREADS
+from endotwin.run.threads import THREADS, one_core
 from endotwin.surface import Surface
 from endotwin.surface.casting import Caster
 from endotwin.twin import Light, Materials, Response, Twin
@@ -230,9 +230,9 @@ class _Fit:
         """As ``light``; without the tone curve that was found ``before``, and near the guides beside which it
         was."""
         samples, surface = pixels.samples, self.twin.surface
-        toned, near_mm = None, None
+        toned, near_mm = None, AT_LENS
         if before is not None:
-            toned, near_mm = before.found.toned, before.decided.effects.guides_mm
+            toned, near_mm = before.found.toned, before.decided.effects.guides_mm or AT_LENS
         shown = samples if toned is None else samples.untoned(toned[0])
         with self.pace.stopwatch.stage("effects"):
 
@@ -240,7 +240,8 @@ class _Fit:
                 return Glints.of(shown[pixels.smooth], surface, start)
 
             late, telling = self.pace.light_is_over, shown[pixels.telling]
-            decided = decide(telling, self.twin, self.caster, glints, self.states, late, near_mm or AT_LENS)
+            with one_core():
+                decided = decide(telling, self.twin, self.caster, glints, self.states, late, near_mm)
             if decided.light is not None or toned is not None:
                 start = _start_beside(decided, shown[pixels.start], surface)
             faint = NOTHING

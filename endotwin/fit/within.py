@@ -286,7 +286,7 @@ class Within:
     ) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]:
         """Columns of the ``free`` directions, of what is ``varied``, first of guides' places, of roughness
         where light is ``diffuse`` or a coat is sought, and then of its weight; and what is known of their
-        coefficients."""
+        coefficients: of γ by BOUNCE_ERROR in brightness, which ratios have less of."""
         mean, spread = (x.numpy() for x in global_prior(self.unit_mm, len(shared.vector)))
         known = np.zeros(seen.by_varied.shape[1])
         known[: 3 * varied.guides] = TEMPER / (ASIDE_SPREAD * self.distance_mm) ** 2
