@@ -12,8 +12,7 @@ from endotwin.effects import Effects
 from endotwin.effects.interreflection import Interreflection
 from endotwin.effects.specular import Specular
 from endotwin.fit.gauss_newton import BOUNCE_ERROR, STANDARD_SPREAD, TEMPER, GaussNewton, unusual
-from endotwin.fit.lighting import Relighting, lit
-from endotwin.fit.model import Globals, at_pixels, predict
+from endotwin.fit.model import Globals
 from endotwin.fit.state import (
     BRIGHTEST,
     DARKEST,
@@ -26,7 +25,6 @@ from endotwin.fit.state import (
     too_dark,
     without_furnace,
 )
-from endotwin.surface.casting import Caster
 from endotwin.twin import Light, Response
 
 
@@ -99,13 +97,9 @@ def explained(gamma: float, bounces: bool) -> tuple[GaussNewton, State]:
     effects = Effects([Specular(), *([Interreflection(4.0)] * bounces)])
     shared = Globals.of(twin.light, Response(gamma), twin.materials.f0, bounce=bounces)
     state = replace(tube_twin.state_of(twin), shared=shared)
-    relighting = Relighting(twin.surface, Caster(twin.surface), effects, samples.views)
-    samples = lit(samples, twin.surface, Caster(twin.surface), effects)
-    solver = GaussNewton(samples, twin.surface.triangles, state.operator)
-    relighting(solver, state)
-    material = at_pixels(solver.samples, solver.triangles, state.materials)
-    shown = (255 * predict(solver.samples, material, shared).clamp(0, 1) + 0.5).to(torch.uint8)
-    solver.relight(replace(solver.samples, color=shown))
+    solver = tube_twin.seen_by_the_fit(twin, samples, state, effects)
+    shown = 255 * tube_twin.shown_to_the_fit(solver, state).clamp(0, 1) + 0.5
+    solver.relight(replace(solver.samples, color=shown.to(torch.uint8)))
     return solver, state
 
 
@@ -122,7 +116,7 @@ def test_a_response_off_the_displays_costs_an_error_of_a_level_a_deviation_where
     assert cost - solver.cost(state, noise) == pytest.approx(expected, rel=1e-6)
 
 
-def test_a_step_goes_to_where_that_cost_falls():
+def test_a_step_from_photos_that_are_explained_takes_the_response_towards_that_of_displays():
     solver, state = explained(0.4, bounces=True)
     found = solver.step(state)
     assert found.fell > 0 and 0.402 < found.state.shared.gamma < 1 / 2.2

@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import torch
 import tube_twin
+from tube_twin import shown_to_the_fit
 
 from endotwin.effects import Effects
 from endotwin.effects.coat import Coat
@@ -18,13 +18,11 @@ from endotwin.effects.specular import Specular
 from endotwin.effects.tone import Tone
 from endotwin.effects.vignetting import Vignetting
 from endotwin.fit.gauss_newton import GaussNewton
-from endotwin.fit.lighting import Relighting, lit
-from endotwin.fit.model import Globals, at_pixels, predict
+from endotwin.fit.model import Globals
 from endotwin.fit.normal_equations import Residual
 from endotwin.fit.state import State
 from endotwin.fit.tilt import Tilter
 from endotwin.render import Renderer
-from endotwin.surface.casting import Caster
 from endotwin.twin import Twin
 
 GUIDES = Offset(((3.2, 0.5, 0.0), (-2.8, 2.7, 0.0)))
@@ -61,27 +59,17 @@ def tube() -> Twin:
 
 def seen_by_the_fit(tube: Twin, effects: Effects) -> tuple[GaussNewton, State]:
     """The tube's pixels under ``effects`` as the fit has them, and what it would fit."""
-    twin, caster = replace(tube, effects=effects), Caster(tube.surface)
     samples, state = tube_twin.photographed(tube, tube.camera, POSES), tube_twin.state_of(tube)
-    shared = Globals.of(twin.light, twin.response, twin.materials.f0, bounce=bool(effects.bounce))
+    shared = Globals.of(tube.light, tube.response, tube.materials.f0, bounce=bool(effects.bounce))
     state = replace(state, shared=replace(shared, coat=effects.get("coat"), tone=effects.get("tone")))
-    # The fit would find its own gains again, of photos without one.
-    relighting = Relighting(tube.surface, caster, effects.without(["gain"]), samples.views)
-    solver = GaussNewton(lit(samples, tube.surface, caster, effects), tube.surface.triangles, state.operator)
-    relighting(solver, state)
-    return solver, state
-
-
-def shown_to_the_fit(solver: GaussNewton, state: State) -> np.ndarray:
-    material = at_pixels(solver.samples, solver.triangles, state.materials)
-    return predict(solver.samples, material, state.shared).numpy()
+    return tube_twin.seen_by_the_fit(tube, samples, state, effects), state
 
 
 @pytest.mark.parametrize("scene", SCENES)
 def test_the_renderers_pixels_are_what_the_fit_predicts(tube, scene):
     effects = Effects([Specular(), *SCENES[scene]])
     twin, (solver, state) = replace(tube, effects=effects), seen_by_the_fit(tube, effects)
-    samples, predicted = solver.samples, shown_to_the_fit(solver, state).clip(0, 1)
+    samples, predicted = solver.samples, shown_to_the_fit(solver, state).numpy().clip(0, 1)
 
     renderer, compared = Renderer(twin), 0
     for frame, pose in enumerate(POSES):
@@ -104,7 +92,7 @@ def test_a_tilt_of_the_normals_starts_from_what_the_fit_predicts(tube, scene):
     solver, state = seen_by_the_fit(tube, effects)
     tilter = Tilter(solver, state, effects)
     _, _, residual = tilter._slopes(solver.samples, tube.surface.normals, np.inf)
-    fitted = Residual.of(solver.samples, torch.from_numpy(shown_to_the_fit(solver, state)), np.inf)
+    fitted = Residual.of(solver.samples, shown_to_the_fit(solver, state), np.inf)
     np.testing.assert_allclose(residual.error, fitted.error, atol=2e-5)
 
 

@@ -9,8 +9,11 @@ import numpy as np
 import torch
 
 from endotwin.cameras import Camera, Pinhole
+from endotwin.effects import Effects
+from endotwin.fit.gauss_newton import GaussNewton
 from endotwin.fit.hashgrid import HashOperator
-from endotwin.fit.model import Globals
+from endotwin.fit.lighting import Relighting, lit
+from endotwin.fit.model import Globals, at_pixels, predict
 from endotwin.fit.state import State, roughness_to_raw
 from endotwin.light.incidence import incidence
 from endotwin.pixels.samples import Samples, Views
@@ -125,6 +128,22 @@ def state_of(twin: Twin) -> State:
     operator = HashOperator.each(len(mean), 0.4)
     table = torch.zeros(operator.forward_csr.shape[1], 4)
     return State(operator, mean, table, Globals.of(twin.light, twin.response, twin.materials.f0))
+
+
+def seen_by_the_fit(twin: Twin, samples: Samples, state: State, effects: Effects) -> GaussNewton:
+    """A solver of ``samples`` of the twin, lit as a fit that has found ``state`` and ``effects`` has them."""
+    surface, caster = twin.surface, Caster(twin.surface)
+    # The fit would find its own gains again, of photos without one.
+    relighting = Relighting(surface, caster, effects.without(["gain"]), samples.views)
+    solver = GaussNewton(lit(samples, surface, caster, effects), surface.triangles, state.operator)
+    relighting(solver, state)
+    return solver
+
+
+def shown_to_the_fit(solver: GaussNewton, state: State) -> torch.Tensor:
+    """Display values of the solver's samples as the fit predicts them, [N, 3]."""
+    material = at_pixels(solver.samples, solver.triangles, state.materials)
+    return predict(solver.samples, material, state.shared)
 
 
 def unfitted(twin: Twin) -> Twin:

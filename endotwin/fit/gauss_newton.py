@@ -174,13 +174,18 @@ class GaussNewton:
         predicted = self._predict(state, log_gain)
         data = robust_cost(self._trial, predicted, HUBER * noise) * share * scale
         prior = float((self.precision * state.table**2).double().sum()) / 2
+        mean, precision = self._prior(state, scale)
+        return data + prior + float((precision * (state.shared.vector - mean) ** 2).sum()) / 2
+
+    def _prior(self, state: State, scale: float) -> tuple[Tensor, Tensor]:
+        """Mean and inverse variance of the shared parameters beside pixels that count ``scale`` each, [G]."""
         mean, spread = self._global_prior(state)
-        off = state.shared.vector - mean
-        bent = self._errors(state, scale) * (off[GAMMA] / STANDARD_SPREAD) ** 2
-        return data + prior + float(((off / spread) ** 2).sum() + bent) / 2
+        precision = 1 / spread**2
+        precision[GAMMA] += self._errors(state, scale) / STANDARD_SPREAD**2
+        return mean, precision
 
     def _errors(self, state: State, scale: float) -> float:
-        """What BOUNCE_ERROR in all pixels counts as, 0 where no light bounces; ``scale``: a pixel's."""
+        """What BOUNCE_ERROR counts in all pixels, of ``scale`` each; 0 where no light bounces."""
         return len(self.samples) * scale * BOUNCE_ERROR**2 if state.shared.bounces else 0.0
 
     def step(self, state: State, joint: bool = True, gains: bool = False) -> Step:
@@ -262,7 +267,6 @@ class GaussNewton:
         self, state: State, equations: NormalEquations, scale: float, free: np.ndarray
     ) -> tuple[Tensor, Tensor]:
         link = state.link_slope[..., None]
-        mean, spread = self._global_prior(state)
 
         def product(x: Tensor) -> Tensor:
             rows, _, columns = x.shape
@@ -283,12 +287,12 @@ class GaussNewton:
         solved = conjugate_gradients(product, right, inverse, self.out_of_time)
 
         if not joint:
-            return solved[..., 0], torch.zeros_like(spread)
-        errors, known = self._errors(state, scale), 1 / spread.numpy() ** 2
-        damping = errors * np.where(np.arange(len(known)) == F0, 0, known)
-        known[GAMMA] += errors / STANDARD_SPREAD**2
-        pull = known * (mean - state.shared.vector).numpy()
-        shared_normal = equations.shared * scale + np.diag(known + damping)
+            return solved[..., 0], torch.zeros_like(state.shared.vector)
+        mean, precision = self._prior(state, scale)
+        damping = self._errors(state, scale) / self._global_prior(state)[1] ** 2
+        damping[F0] = 0
+        pull = (precision * (mean - state.shared.vector)).numpy()
+        shared_normal = equations.shared * scale + np.diag(precision + damping)
         shared_right = free.T @ (equations.shared_right * scale + pull)
         weights, along = _joint_minimum(
             solved, product(solved), right, free.T @ shared_normal @ free, shared_right
