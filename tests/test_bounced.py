@@ -1,10 +1,7 @@
 """Bounced light at points, against what an integrating sphere makes of it."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
-import scipy.sparse
 import torch
 import trimesh
 from independent.gloss import Gloss
@@ -78,23 +75,30 @@ def test_one_view_is_as_one_of_several(sphere):
     np.testing.assert_allclose(several[::2].mean(), several[1::2].mean(), rtol=0.01)
 
 
-def test_what_points_mirror_is_the_radiosity_of_tissue_over_their_own_irradiance(sphere):
-    """Places mirror those before them, and every third one nothing that was seen."""
+def test_what_points_mirror_is_tissue_without_what_its_own_lobes_make_of_direct_light(sphere):
+    """The lens looks from the centre, straight ahead at a place that facets mirror to the other side, which
+    no light reaches but what bounces; those steeper than π/8 (Walter et al. 2007, eq. 35) to the lit side."""
     light, places, albedo = sphere
-    seen = np.arange(len(places.view)) % 3 > 0
-    before = places.weights[np.arange(len(seen)) - 1]
-    rows = scipy.sparse.diags_array(seen.astype(np.float32)).tocsr() @ before
-    rows.eliminate_zeros()
-    irradiance, leaving = (Places(before, places.view).of(x) for x in light.between(0.5, 2.0, albedo))
-    own = light.at(places, 0.5, 2.0, albedo)
-    found = light.expanded(
-        replace(places, mirrored=scipy.sparse.csr_array(rows)), 0.5, 2.0, albedo, torch.zeros(len(seen))
-    )
-    np.testing.assert_allclose(found.surroundings[seen], (leaving / own)[seen], rtol=1e-4)
-    assert (found.surroundings[~seen] == 1).all()
-    assert (leaving > BASE_COLOR * irradiance).all()
-    there = found.irradiance(0.5, 2.0)
+    found = light.expanded(places, 0.0, 2.0, albedo, torch.zeros(len(places.view)))
+    z_mm = places.weights @ light._radiosity.centre_mm[:, 2]
+    arriving, mirrored = (places.of(each) for each in light.between(0.0, 2.0, albedo))
+    np.testing.assert_allclose(found.surroundings, mirrored / arriving, rtol=1e-5)
+    ahead, behind = z_mm > 0.9 * RADIUS_MM, z_mm < -0.9 * RADIUS_MM
+    dark = (BASE_COLOR + GLOSSY) * arriving[behind].mean()
+    steep = 1 / (1 + (np.tan(np.pi / 8) / ROUGHNESS_TISSUE**2) ** 2)
+    expected = dark + steep * BASE_COLOR / RADIUS_MM**2
+    assert mirrored[ahead].mean() == pytest.approx(expected, rel=0.03)
+    np.testing.assert_allclose(mirrored[behind], arriving[behind], rtol=1e-5)
+    there = found.irradiance(0.0, 2.0)
     torch.testing.assert_close(found.mirrored(there), there * found.surroundings)
+
+
+def test_without_white_lobes_points_are_as_if_light_came_from_all_around(sphere):
+    light, places, albedo = sphere
+    dull = Albedo(albedo.base_color, 0 * albedo.glossy)
+    arriving, mirrored = light.between(0.5, 2.0, dull)
+    np.testing.assert_array_equal(arriving, mirrored)
+    assert light.expanded(places, 0.5, 2.0, albedo).surroundings is None
 
 
 def test_the_expansion_is_exact_where_it_was_made_and_follows_the_light(sphere):

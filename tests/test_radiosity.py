@@ -79,7 +79,7 @@ def test_half_a_sphere_whose_wall_is_the_other_half_gets_the_bounce_of_the_whole
     true = albedo / (1 - albedo) * RADIUS_MM**-2.0 / 6
     assert bounced.mean() == pytest.approx(true, rel=0.02)
     assert bounced.std() < 0.1 * true
-    assert bounced.shape == (half.count, 1, 3)
+    assert bounced.shape == (half.form_factors.shape[0], 1, 3)
 
 
 def test_nothing_of_the_wall_lies_in_the_way_of_light_to_the_surface(hollow_sphere):

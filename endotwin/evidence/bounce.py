@@ -49,13 +49,14 @@ def bounced(probe: Probe, hypothesis: Hypothesis) -> Bounced:
     patch = radiosity.patch_of[samples.triangle.numpy()]
     linear = (np.maximum(samples.color.numpy(), 1) / 255.0) ** (1 / gamma)
     lobes = Lobes(F0_DIELECTRIC)
-    glossy, gloss = lobes.glossy_albedo(roughness).numpy(), lobes.gloss(samples.cos, roughness)
+    glossy = np.full((radiosity.count, 1), lobes.glossy_albedo(roughness))
+    gloss = lobes.gloss(samples.cos, roughness).numpy()
     direct_light = probe.direct_light(hypothesis, n, q)
 
     def seen(irradiance: np.ndarray, base_color: np.ndarray) -> np.ndarray:
         """Irradiance [N, 3] as tissue of base colours [P, 3] shows it, [N]."""
         color = places.weights @ base_color
-        return (irradiance * (color + gloss.numpy()[:, None])).sum(axis=1) / color.sum(axis=1)
+        return (irradiance * (color + gloss[:, None])).sum(axis=1) / color.sum(axis=1)
 
     def under(brightest: float) -> Bounced:
         light_there = direct_light
@@ -63,7 +64,7 @@ def bounced(probe: Probe, hypothesis: Hypothesis) -> Bounced:
             base_color, L0 = _patch_albedo(linear, light_there, patch, radiosity.count, brightest)
             albedo = Albedo(base_color, glossy)
             light_there = direct_light + seen(light.at(places, n, q, albedo.scaled(0.0)), base_color)
-        found = light.expanded(places, n, q, albedo, gloss, by=("n", "q"))
+        found = light.expanded(places, n, q, albedo, by=("n", "q"))
         log = np.log(np.maximum(seen(found.irradiance(n, q).numpy(), base_color), 1e-30))
         return Bounced(log, found.by_n.numpy(), found.by_q.numpy(), L0)
 

@@ -7,7 +7,6 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
-import scipy.sparse
 import torch
 from torch import Tensor
 
@@ -22,13 +21,11 @@ from endotwin.fit.state import State
 from endotwin.fit.within import Renewed, Varied
 from endotwin.light.bounced import BOUNCES_BY, GAMMA_STEP, Albedo, BouncedLight, Places
 from endotwin.light.guides import AT_LENS, COSINE, Guided, guided, log_axis, visible_in_views
-from endotwin.light.mirror import met_mirrored
 from endotwin.light.radiosity import Radiosity
 from endotwin.pixels.samples import Samples, Views
 from endotwin.run.ahead import on_all_cores
 from endotwin.surface import Surface
 from endotwin.surface.casting import Caster
-from endotwin.surface.vectors import unit
 
 
 def lit(samples: Samples, surface: Surface, caster: Caster, effects: Effects) -> Samples:
@@ -230,7 +227,7 @@ class Bouncer:
         def albedo(base_color: Tensor) -> Albedo:
             return Albedo.of(self._radiosity, base_color, materials[:, 3], lobes, triangles.numpy())
 
-        places, base_color = self._places(samples, lobes.shine), materials[:, :3]
+        places, base_color = self._places(samples), materials[:, :3]
         gloss = lobes.gloss(samples.cos, roughness) * math.exp(-scale)
         by, seen_by = ("scale",), None
         if not self.light_stays:
@@ -240,33 +237,16 @@ class Bouncer:
         shown = shared.gamma * torch.log(at_pixels(samples, triangles, base_color))
         return replace(samples, bounce=replace(bounce, shown=shown))
 
-    def _places(self, samples: Samples, shine: bool) -> Places:
-        """Where the samples lie, and what they mirror if they ``shine``; kept for the steps that follow, of
-        the samples that any thread asked for last."""
+    def _places(self, samples: Samples) -> Places:
+        """Where the samples lie; kept for the steps that follow, of the samples that any thread asked for
+        last."""
         pixel, places = self._placed
         if pixel is not samples.pixel:
             to_vertex, triangles = self._radiosity.to_vertex, self._surface.triangles
             view = samples.views.row(samples.frame)
-            mirrored = self._mirrored(samples, view) if shine else None
-            places = Places(to_vertex[samples.nearest(triangles)], view, mirrored)
+            places = Places(to_vertex[samples.nearest(triangles)], view)
             self._placed = samples.pixel, places
         return places
-
-    def _mirrored(self, samples: Samples, view: np.ndarray) -> scipy.sparse.csr_array:
-        """CSR [N, P], from patches to what each sample mirrors to its camera."""
-        surface, to_vertex = self._surface, self._radiosity.to_vertex
-        triangles = torch.from_numpy(surface.triangles.astype(np.int64))
-        points_mm, normals = (
-            at_pixels(samples, triangles, torch.from_numpy(values)).numpy()
-            for values in (surface.vertices_mm, surface.normals)
-        )
-        eye_mm = samples.views.T_local_camera[view, :3, 3].astype(np.float32)
-        triangle, barycentric = met_mirrored(self._caster, points_mm, eye_mm, unit(normals))
-        met = triangle >= 0
-        nearest = surface.triangles[triangle[met], barycentric[met].argmax(axis=1)]
-        one = np.ones(len(nearest), np.float32)
-        picked = (one, nearest, np.concatenate([[0], np.cumsum(met)]))
-        return scipy.sparse.csr_array(picked, shape=(len(met), to_vertex.shape[0])) @ to_vertex
 
 
 def regained(samples: Samples, material: Tensor, shared: Globals, effects: Effects, width: float) -> Effects:

@@ -70,45 +70,23 @@ class Places:
     Attributes:
         weights: CSR [N, P], interpolation from patches (``Radiosity.to_points``).
         view: int [N], in which view each point is seen.
-        mirrored: CSR [N, P], to what each mirrors to that view's camera, where it does not mirror what nobody
-            saw; None: light comes from all around alike.
     """
 
     weights: scipy.sparse.csr_array
     view: np.ndarray
-    mirrored: scipy.sparse.csr_array | None = None
 
     def of(self, per_patch: np.ndarray) -> np.ndarray:
         """Values [P, M, C] of patches in M views at the points, [N, C]."""
-        return self._from_views @ _by_view(per_patch, self._from_views)
-
-    def surroundings(self, leaving: np.ndarray, arriving: np.ndarray) -> np.ndarray:
-        """Radiosity of what the points mirror, of that of patches [P, M, 3], over what is ``arriving`` [N, 3]
-        at them; 1 where they mirror what nobody saw."""
-        met = np.diff(self.mirrored.indptr) > 0
-        mirrored = self._mirrored_from_views @ _by_view(leaving, self._mirrored_from_views)
-        return np.where(met[:, None], mirrored / arriving, 1).astype(np.float32)
+        by_view = np.swapaxes(per_patch, 0, 1).reshape(-1, per_patch.shape[2])
+        return self._from_views @ by_view[: self._from_views.shape[1]]
 
     @cached_property
     def _from_views(self) -> scipy.sparse.csr_array:
-        return _in_views(self.weights, self.view)
-
-    @cached_property
-    def _mirrored_from_views(self) -> scipy.sparse.csr_array:
-        return _in_views(self.mirrored, self.view)
-
-
-def _in_views(weights: scipy.sparse.csr_array, view: np.ndarray) -> scipy.sparse.csr_array:
-    """CSR [N, M·P], from patches in each of M views, by ``weights`` [N, P] of points in the ``view`` [N]."""
-    patches = weights.shape[1]
-    views = np.repeat(view.astype(np.int32), np.diff(weights.indptr))
-    shape = len(view), (int(view.max(initial=0)) + 1) * patches
-    return scipy.sparse.csr_array((weights.data, patches * views + weights.indices, weights.indptr), shape)
-
-
-def _by_view(per_patch: np.ndarray, from_views: scipy.sparse.csr_array) -> np.ndarray:
-    """Values [P, M, C] as ``from_views`` takes them, [M·P, C]."""
-    return np.swapaxes(per_patch, 0, 1).reshape(-1, per_patch.shape[2])[: from_views.shape[1]]
+        patches = self.weights.shape[1]
+        views = np.repeat(self.view.astype(np.int32), np.diff(self.weights.indptr))
+        shape = len(self.view), (int(self.view.max(initial=0)) + 1) * patches
+        columns = patches * views + self.weights.indices
+        return scipy.sparse.csr_array((self.weights.data, columns, self.weights.indptr), shape)
 
 
 @dataclass(frozen=True)
@@ -128,7 +106,7 @@ class Bounce(Rows):
     by_q: Tensor
     by_scale: Tensor
     by_gamma: Tensor
-    gloss: Tensor
+    gloss: Tensor | None = None
     surroundings: Tensor | None = None
     shown: Tensor | None = None
 
@@ -175,18 +153,37 @@ class BouncedLight:
         ]
         middle_mm = np.mean(np.asarray(guides_mm), axis=0)
         self._sources_mm = T_local_camera[:, :3, 3] + T_local_camera[:, :3, :3] @ middle_mm
+        self._T_local_camera = T_local_camera
 
     def at(self, places: Places, n: float, q: float, albedo: Albedo) -> np.ndarray:
         """Irradiance float32 [N, 3] with L0 = 1 and patches of ``albedo``."""
-        return places.of(self.between(n, q, albedo)[0])
+        return places.of(self._between(n, q, albedo)[1][: self._radiosity.count])
 
     def between(self, n: float, q: float, albedo: Albedo) -> tuple[np.ndarray, np.ndarray]:
-        """Indirect irradiance and radiosity of patches of ``albedo``, float32 [P, M, 3], with L0 = 1."""
-        direct = np.stack([self._radiosity.direct(lamps, n, q).mean(axis=1) for lamps in self._lamps], axis=1)
+        """Indirect irradiance of patches of ``albedo``, and radiosity of what they mirror to the cameras,
+        float32 [P, M, 3], with L0 = 1."""
+        direct, arriving = self._between(n, q, albedo)
+        return arriving[: self._radiosity.count], self._mirrored(direct, arriving, albedo)
+
+    def _between(self, n: float, q: float, albedo: Albedo) -> tuple[np.ndarray, np.ndarray]:
+        """Direct irradiance [P + W, M] and indirect one [P + W, M, 3] of patches and the wall's, float32."""
+        radiosity = self._radiosity
+        direct = np.stack([radiosity.direct(lamps, n, q).mean(axis=1) for lamps in self._lamps], axis=1)
         mirrors = self._mirrors if albedo.glossy.any() else ()
-        arriving = self._radiosity.indirect(direct, albedo.base_color, albedo.glossy, mirrors)
-        sent = (albedo.base_color + albedo.glossy)[:, None].astype(np.float32)
-        return arriving, sent * (direct[: len(arriving), :, None] + arriving)
+        return direct, radiosity.indirect(direct, albedo.base_color, albedo.glossy, mirrors)
+
+    def _mirrored(self, direct: np.ndarray, arriving: np.ndarray, albedo: Albedo) -> np.ndarray:
+        """Radiosity of what patches mirror to the cameras, float32 [P, M, 3], in the light of ``_between``:
+        as if it came from all around where nothing is to be seen, or no lobe is white."""
+        mirrored = arriving[: self._radiosity.count].copy()
+        if not albedo.glossy.any():
+            return mirrored
+        color, glossy = (self._radiosity.walled(x) for x in (albedo.base_color, albedo.glossy))
+        leaving = color * (direct[..., None] + arriving) + glossy * arriving
+        for view, factors in enumerate(self._shown):
+            mirrored[:, view] *= (1 - factors.sum(axis=1))[:, None]
+            mirrored[:, view] += factors @ leaving[:, view]
+        return mirrored
 
     @cached_property
     def _mirrors(self) -> list[scipy.sparse.csr_array]:
@@ -194,30 +191,36 @@ class BouncedLight:
         views = zip(self._sources_mm, self._lamps, strict=True)
         return [self._radiosity.mirror_factors(source_mm, lamps) for source_mm, lamps in views]
 
+    @cached_property
+    def _shown(self) -> list[scipy.sparse.csr_array]:
+        """What white lobes show to each view's camera."""
+        return [self._radiosity.mirrored_factors(pose) for pose in self._T_local_camera]
+
     def expanded(
         self,
         places: Places,
         n: float,
         q: float,
         albedo: Albedo,
-        gloss: Tensor,
+        gloss: Tensor | None = None,
         log_scale: float = 0.0,
         seen_by: tuple[float, Albedo] | None = None,
         by: Collection[str] = BOUNCES_BY,
     ) -> Bounce:
         """The bounce as a function of n, q, the albedo's scale and γ, exact where they are as given here.
 
-        ``gloss`` [N] is the bounce's. ``seen_by``: γ, and the albedo that photos tell of with γ + GAMMA_STEP;
-        None: whatever γ, the albedo is the same. ``by``: those of BOUNCES_BY that are to change; each of them
-        takes its time.
+        ``gloss`` [N] is the bounce's; None: what points mirror is not asked for. ``seen_by``: γ, and the
+        albedo that photos tell of with γ + GAMMA_STEP; None: whatever γ, the albedo is the same. ``by``:
+        those of BOUNCES_BY that are to change; each of them takes its time.
         """
 
         def log_irradiance(n: float, q: float, log_scale: float, albedo: Albedo = albedo) -> np.ndarray:
             return np.log(np.maximum(self.at(places, n, q, albedo.scaled(log_scale)), DARKEST))
 
-        arriving, leaving = self.between(n, q, albedo.scaled(log_scale))
-        irradiance = np.maximum(places.of(arriving), DARKEST)
-        here, about = np.log(irradiance), np.array([n, q, log_scale])
+        scaled, about = albedo.scaled(log_scale), np.array([n, q, log_scale])
+        direct, arriving = self._between(n, q, scaled)
+        irradiance = np.maximum(places.of(arriving[: self._radiosity.count]), DARKEST)
+        here = np.log(irradiance)
         moved = [tuple(about + LIGHT_STEP * (np.array(BOUNCES_BY) == name)) for name in by]
         gamma, by_gamma = 0.0, np.zeros_like(here)
         if seen_by is not None:
@@ -233,7 +236,7 @@ class BouncedLight:
             torch.from_numpy(np.ascontiguousarray(x, np.float32))
             for x in (level, by_n, by_q, by_scale, by_gamma)
         ]
-        surroundings = (
-            None if places.mirrored is None else torch.from_numpy(places.surroundings(leaving, irradiance))
-        )
-        return Bounce(*columns, gloss, surroundings)
+        if gloss is None:
+            return Bounce(*columns)
+        surroundings = places.of(self._mirrored(direct, arriving, scaled)) / irradiance
+        return Bounce(*columns, gloss, torch.from_numpy(surroundings.astype(np.float32)))

@@ -16,8 +16,7 @@ import torch
 from endotwin.light import shading
 from endotwin.light.forward import Lobes
 from endotwin.light.incidence import COS_MIN
-from endotwin.surface.casting import Caster
-from endotwin.surface.vectors import dot, frame_along, scaled, unit
+from endotwin.surface.vectors import dot, frame_along, unit
 
 TURN = (math.sqrt(5) - 1) / 2
 """From facet to facet about the normal, of a full turn: the golden angle."""
@@ -51,22 +50,6 @@ def mirrored(
     lobe = (4 * cos_o * shading.smith_visibility(cos_i, cos_o, roughness**2) * fresnel).numpy()
     share = lobe * facing * np.sqrt(1 + slope * slope) / float(facets * Lobes(f0).glossy_albedo(roughness))
     return out, np.where((facing > 0) & (dot(normal, out) > 0), share, 0)
-
-
-def met_mirrored(
-    caster: Caster, points_mm: np.ndarray, eye_mm: np.ndarray, normals: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """What points of a surface mirror to an eye: triangle int32 [N] (−1: nothing that was seen) and
-    barycentric float32 [N, 3].
-
-    Args:
-        points_mm, eye_mm: float32 [N, 3]. normals: unit, [N, 3]; all in the surface's local frame.
-    """
-    ray = points_mm - eye_mm
-    lift_mm = LIFT * np.sqrt(dot(ray, ray))
-    direction = unit(ray - scaled(normals, 2 * dot(ray, normals)))
-    triangle, barycentric, _ = caster.cast_rays(points_mm + scaled(normals, lift_mm), direction)
-    return triangle, barycentric
 
 
 def _facets(

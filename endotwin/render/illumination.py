@@ -16,7 +16,6 @@ from endotwin.light.film import film_in_view
 from endotwin.light.forward import Lit, Lobes, radiance
 from endotwin.light.guides import AT_LENS, COSINE, guided, lamps_mm, log_axis, visible_from
 from endotwin.light.incidence import COS_MIN, incidence_on
-from endotwin.light.mirror import met_mirrored
 from endotwin.light.radiosity import Radiosity
 from endotwin.surface.casting import Caster, Correspondences
 from endotwin.surface.vectors import dot
@@ -82,7 +81,7 @@ class Illumination:
         )
 
     def _bounced(self, T_local_camera: np.ndarray) -> np.ndarray:
-        """Indirect irradiance of the vertices and their radiosity, float32 [V, 6], with L0 = 1."""
+        """``ViewLight.bounced`` of the view from there."""
         light, effects, to_vertex = self.twin.light, self.twin.effects, self._radiosity.to_vertex
         guides_mm = effects.guides_mm or AT_LENS
         bounced = BouncedLight(self._radiosity, T_local_camera[None], guides_mm, effects.profile)
@@ -96,8 +95,8 @@ class ViewLight:
 
     Attributes:
         T_local_camera: the pose in the surface's frame, float64 [4, 4].
-        bounced: indirect irradiance and radiosity of each vertex, float32 [V, 6], with L0 = 1; None: no light
-            bounces.
+        bounced: indirect irradiance of each vertex and radiosity of what it mirrors to the camera, float32
+            [V, 6], with L0 = 1; None: no light bounces.
         film: radiance that the film at each vertex sends to the camera, float32 [V]; None: nothing.
     """
 
@@ -135,32 +134,18 @@ class ViewLight:
         cos_o = np.clip(-dot(normals, view), COS_MIN, 1)
         return Lit(torch.from_numpy(cos_o), guides), visible
 
-    def mirrored(self, hits: Correspondences, normals: np.ndarray) -> Correspondences | None:
-        """What the hits, with ``normals`` [N, 3] in the camera frame, mirror to the camera, where that was
-        seen; its pixels are rows of the hits. None where no light bounces, or nothing mirrors it."""
-        if self.bounced is None or not _lobes(self.twin).shine:
-            return None
-        surface, pose = self.caster.surface, self.T_local_camera.astype(np.float32)
-        points_mm = hits.interpolate(surface, surface.vertices_mm)
-        eye_mm = np.broadcast_to(pose[:3, 3], points_mm.shape)
-        triangle, barycentric = met_mirrored(self.caster, points_mm, eye_mm, normals @ pose[:3, :3].T)
-        met = np.flatnonzero(triangle >= 0)
-        return Correspondences(met, triangle[met], barycentric[met], hits.distance_mm[met])
-
-    def radiance(
-        self, hits: Correspondences, lit: Lit, material: Tensor, mirrored: Correspondences | None
-    ) -> Tensor:
-        """Radiance of hits, float32 [N, 3], that the guides light so, and that show what is ``mirrored``;
-        ``material``: base colour, roughness and metallic of the hits, [N, 5]."""
+    def radiance(self, hits: Correspondences, lit: Lit, material: Tensor) -> Tensor:
+        """Radiance of hits, float32 [N, 3], that the guides light so; ``material``: base colour, roughness
+        and metallic of the hits, [N, 5]."""
         twin, roughness = self.twin, material[:, 3]
         if self.bounced is not None:
             gloss = _lobes(twin).gloss(lit.cos_o.clamp(max=1), roughness)
-            irradiance = hits.interpolate(twin.surface, self.bounced[:, :3])
-            shown = irradiance.copy()
-            if mirrored is not None:
-                shown[mirrored.pixel] = mirrored.interpolate(twin.surface, self.bounced[:, 3:])
+            irradiance, mirrored = np.split(hits.interpolate(twin.surface, self.bounced), 2, axis=1)
             lit = replace(
-                lit, irradiance=torch.from_numpy(irradiance), mirrored=torch.from_numpy(shown), gloss=gloss
+                lit,
+                irradiance=torch.from_numpy(irradiance),
+                mirrored=torch.from_numpy(mirrored),
+                gloss=gloss,
             )
         base_color = material[:, :3] * (1 - material[:, 4:])
         x = radiance(lit, log_light(twin), base_color, roughness, _lobes(twin))

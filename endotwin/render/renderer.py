@@ -274,7 +274,7 @@ class Renderer:
         material = torch.from_numpy(hits.interpolate(surface, self._material))
         facing = -dot(normals, rays.pixel_directions.reshape(-1, 3).take(hits.pixel, axis=0)) > FACING
         lit, visible = light.lit(hits, rays.pixel_directions, normals)
-        return _Points(hits, normals, material, facing, lit, visible, light.mirrored(hits, normals))
+        return _Points(hits, normals, material, facing, lit, visible)
 
 
 @dataclass(frozen=True, eq=False)
@@ -284,7 +284,7 @@ class _Points:
     Attributes:
         hits: N of them. normals: float32 [N, 3], unit, in the camera frame. material: base colour, roughness
             and metallic, [N, 5]. facing: bool [N], those that face their ray. lit: what the light guides do.
-        visible: which guides they see, [N, K]; None where no shadow is cast. mirrored: see ``ViewLight``.
+        visible: which guides they see, [N, K]; None where no shadow is cast.
     """
 
     hits: Correspondences
@@ -293,11 +293,10 @@ class _Points:
     facing: np.ndarray
     lit: Lit
     visible: np.ndarray | None
-    mirrored: Correspondences | None
 
     def radiance(self, light: ViewLight) -> np.ndarray:
         """Float32 [N, 3]."""
-        return light.radiance(self.hits, self.lit, self.material, self.mirrored).numpy()
+        return light.radiance(self.hits, self.lit, self.material).numpy()
 
     def image(self, light: ViewLight, shape: tuple[int, int]) -> np.ndarray:
         """Their radiance [H, W, 3], where they are those of pixels; 0 where no surface is met."""

@@ -14,7 +14,7 @@ Lengths are in millimetres. The world is the colon's; camera frames follow OpenC
 forward), pixel centres are at integers. Formulas are written from their sources, with numpy; Embree only
 answers which triangle a ray meets.
 
-Left out: from patch to patch light travels as if all reflection were diffuse, and a pixel's lobes reflect
-what lies in the mirror's direction; a coat adds its highlight and takes nothing from what is under it; guides
-are points, so that shadows are hard; the photos are neither sharpened nor compressed.
+Left out: from patch to patch all but the lamps' light travels as if all reflection were diffuse; a coat adds
+its highlight and takes nothing from what is under it; guides are points, so that shadows are hard; the photos
+are neither sharpened nor compressed.
 """

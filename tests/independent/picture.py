@@ -40,7 +40,6 @@ class View:
     place: np.ndarray
     tissue: np.ndarray
     seen: np.ndarray
-    mirrored: np.ndarray | None
 
 
 class Studio:
@@ -75,7 +74,6 @@ class Studio:
             hits.place,
             sampled(self.tissue, self._finer * hits.place),
             np.stack(seen, axis=1),
-            self.wall.mirrored(hits, directions) if self._bounce else None,
         )
 
     def radiance(self, view: View, scene: Scene, glossy: bool = True) -> np.ndarray:
@@ -99,7 +97,7 @@ class Studio:
                 shine += scene.coat_weight * strength * film
         x = 2 * albedo * diffuse[:, None] + 2 * np.pi * shine[:, None]
         if "interreflection" in scene.effects:
-            arriving, mirrored = self._bounce.at(view.frame, view.place, view.mirrored)
+            arriving, mirrored = self._bounce.at(view.frame, view.place)
             share = self._glossy(scene, dot(view.normals, to_eye), roughness)
             x += 2 * scene.L0 * (albedo * arriving + share[:, None] * mirrored)
         if "vignetting" in scene.effects:
@@ -153,7 +151,9 @@ class Studio:
             for frame, pose in enumerate(self.poses):
                 found = radiosity.mirrored(lamp, pose, roughness, lobe.f0, rng)
                 mirrored[:, frame] += weight * found
-        return radiosity.bounce(direct, radiosity.tissue[:, :3], glossy, mirrored)
+        facets = [(lobe.f0, weight, roughness) for lobe, weight, roughness in lobes]
+        shown = [radiosity.shown(pose, facets, rng) for pose in self.poses]
+        return radiosity.bounce(direct, radiosity.tissue[:, :3], glossy, mirrored, shown)
 
     def _expose(self) -> None:
         """Set L0 by what a coarse look at all frames shows."""

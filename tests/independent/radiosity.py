@@ -2,7 +2,8 @@
 
 Patches are blocks of the grid. E = K·ρ·(E_direct + E) with K the share of a patch's cosine-weighted rays that
 end on each other patch (Goral et al. 1984). What white lobes make of a lamp's light goes where their facets
-mirror it; all other reflection from patch to patch is diffuse.
+mirror it, and the camera is shown what facets mirror to it; all other reflection from patch to patch is
+diffuse.
 """
 
 from __future__ import annotations
@@ -34,18 +35,15 @@ MOST_BOUNCES = 200
 
 @dataclass(frozen=True)
 class Bounce:
-    """Indirect irradiance and radiosity of patches in F frames, float32 [F, R, C, 3]."""
+    """Indirect irradiance of patches in F frames, and radiosity of what they mirror to the camera, float32
+    [F, R, C, 3]."""
 
     arriving: np.ndarray
-    leaving: np.ndarray
+    shown: np.ndarray
 
-    def at(self, frame: int, place: np.ndarray, mirrored: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Indirect irradiance at places [N, 2] of the wall, and radiosity at places [N, 2] that they mirror;
-        interpolated between patches' centres."""
-        return (
-            sampled(self.arriving[frame], place / BLOCK - 0.5),
-            sampled(self.leaving[frame], mirrored / BLOCK - 0.5),
-        )
+    def at(self, frame: int, place: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Both at places [N, 2] of the wall, interpolated between patches' centres."""
+        return tuple(sampled(of[frame], place / BLOCK - 0.5) for of in (self.arriving, self.shown))
 
 
 class Radiosity:
@@ -88,24 +86,59 @@ class Radiosity:
     ) -> np.ndarray:
         """Irradiance float32 [P] of that lamp's light where facets of patches of ``roughness`` [P] mirror it:
         each triangle's flux follows a few of its facets, drawn by their visible share."""
-        flux, lift_mm = np.zeros(len(self._triangles)), LIFT * float(np.ptp(self._centres_mm, axis=0).max())
+        flux = np.zeros(len(self._triangles))
         for triangles, irradiance, to_light in self._lit(lamp, pose):
-            each = np.repeat(np.arange(len(triangles)), FACETS)
-            normals, draw = self._normals[triangles][each], rng.random((len(each), 2))
-            rough = roughness[self.patch_of[triangles]][each]
-            out, share = reflected(normals, to_light[each], rough, f0, draw[:, 0], draw[:, 1])
-            hit = self._wall.hit_triangle(self._centres_mm[triangles][each] + lift_mm * normals, out)
-            landed = (hit >= 0) & (share > 0)
-            sent = share * (irradiance * self._area[triangles])[each] / FACETS
-            flux += np.bincount(self.patch_of[hit[landed]], sent[landed], len(flux))
+            each, met, share = self._by_facets(triangles, to_light, roughness, f0, rng)
+            sent = share * (irradiance * self._area[triangles])[each]
+            flux += np.bincount(met, sent, len(flux))
         return (flux / self.area_mm2).astype(np.float32)
 
+    def shown(
+        self, pose: np.ndarray, lobes: list[tuple[float, float, np.ndarray]], rng: np.random.Generator
+    ) -> scipy.sparse.csr_array:
+        """CSR [P, P], means over what facets of patches mirror to a camera at ``pose`` [4, 4]: those of the
+        ``lobes``, of reflectance f0, weight and roughness [P]. A row is empty where the camera sees none."""
+        parts = []
+        for triangles, _, to_eye in self._lit(Lamp(L0=1, n=0, q=0), pose):
+            for f0, weight, roughness in lobes:
+                each, met, share = self._by_facets(triangles, to_eye, roughness, f0, rng)
+                seen = triangles[each]
+                parts.append((self.patch_of[seen], met, weight * share * self._area[seen]))
+        row, column, share = map(np.concatenate, zip(*parts, strict=True))
+        share = share / np.bincount(row, share, len(self._triangles))[row]
+        shape = (len(self._triangles),) * 2
+        return scipy.sparse.coo_array((share.astype(np.float32), (row, column)), shape=shape).tocsr()
+
+    def _by_facets(
+        self,
+        triangles: np.ndarray,
+        to_end: np.ndarray,
+        roughness: np.ndarray,
+        f0: float,
+        rng: np.random.Generator,
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Ways from directions ``to_end`` [N, 3] of triangles [N] by FACETS facets of each to other patches:
+        which of the N, the patch, and its share of what lobes of ``roughness`` [P] reflect."""
+        lift_mm = LIFT * float(np.ptp(self._centres_mm, axis=0).max())
+        each = np.repeat(np.arange(len(triangles)), FACETS)
+        normals, draw = self._normals[triangles][each], rng.random((len(each), 2))
+        rough = roughness[self.patch_of[triangles]][each]
+        out, share = reflected(normals, to_end[each], rough, f0, draw[:, 0], draw[:, 1])
+        hit = self._wall.hit_triangle(self._centres_mm[triangles][each] + lift_mm * normals, out)
+        landed = (hit >= 0) & (share > 0)
+        return each[landed], self.patch_of[hit[landed]], share[landed] / FACETS
+
     def bounce(
-        self, direct: np.ndarray, color: np.ndarray, glossy: np.ndarray, mirrored: np.ndarray
+        self,
+        direct: np.ndarray,
+        color: np.ndarray,
+        glossy: np.ndarray,
+        mirrored: np.ndarray,
+        shown: list[scipy.sparse.csr_array] | None = None,
     ) -> Bounce:
         """All light between patches [P] for direct irradiance [P, F], of which ``mirrored`` [P, F] is what
         white lobes throw on; they send ``glossy`` [P] of all other light back, and diffuse ones ``color``
-        [P, 3]."""
+        [P, 3]. What so leaves patches is ``shown`` to F cameras; by default they are shown what arrives."""
         color, direct = color[:, None].astype(np.float32), direct[..., None]
         albedo = color + glossy[:, None, None].astype(np.float32)
         arriving = np.zeros(np.broadcast_shapes(color.shape, direct.shape), np.float32)
@@ -116,8 +149,11 @@ class Radiosity:
             arriving = met.reshape(arriving.shape) + mirrored[..., None]
             if np.abs(arriving - before).max() <= CONVERGED * arriving.max():
                 break
-        leaving = albedo * (direct + arriving)
-        return Bounce(*(np.moveaxis(x, 1, 0).reshape(-1, *self.shape, 3) for x in (arriving, leaving)))
+        views = arriving.copy()
+        for frame, mixture in enumerate(shown or ()):
+            seen = np.diff(mixture.indptr) > 0
+            views[seen, frame] = (mixture @ leaving[:, frame])[seen]
+        return Bounce(*(np.moveaxis(x, 1, 0).reshape(-1, *self.shape, 3) for x in (arriving, views)))
 
     def _lit(self, lamp: Lamp, pose: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
         """Of each guide the triangles int [N] that it lights, their irradiance [N] and directions [N, 3] to

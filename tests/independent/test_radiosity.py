@@ -58,3 +58,26 @@ def test_smooth_facets_throw_light_from_a_spheres_centre_across_it() -> None:
     across = np.roll(direct[::-1], radiosity.shape[1] // 2, axis=1)
     np.testing.assert_allclose(found[:3].mean(axis=1), f0 * across[:3].mean(axis=1), rtol=0.1)
     assert found[5:].max() < 0.01 * found[:2].min()
+
+
+def test_a_camera_at_a_spheres_centre_is_shown_the_other_side_by_smooth_facets() -> None:
+    wall = sphere(12)
+    radiosity = Radiosity(wall, np.ones((*wall.shape, 3)), np.random.default_rng(0))
+    smooth = np.full(len(radiosity.tissue), 0.1)
+    mixture = radiosity.shown(np.eye(4), [(0.04, 1.0, smooth)], np.random.default_rng(1))
+    place_mm = radiosity._mean(radiosity._centres_mm)
+    seen = np.flatnonzero(place_mm[:, 2] > 2)
+    np.testing.assert_allclose(mixture.sum(axis=1)[seen], 1, rtol=1e-5)
+    np.testing.assert_allclose((mixture @ place_mm)[seen], -place_mm[seen], atol=1.5)
+
+
+def test_cameras_see_what_leaves_patches_but_for_what_lobes_make_of_the_lamps_light() -> None:
+    """A single bounce between halves of albedo 0.5 that mirror each other's radiosity."""
+    wall = sphere(12)
+    radiosity = Radiosity(wall, np.full((*wall.shape, 3), 0.5), np.random.default_rng(0))
+    direct = radiosity.direct(Lamp(L0=700, n=1.5, q=2), np.eye(4))[:, None]
+    gloss, nothing = np.full(len(direct), 0.03), np.zeros_like(direct)
+    mixture = [radiosity.form_factors]
+    found = radiosity.bounce(direct, radiosity.tissue, gloss, nothing, mixture)
+    leaving = 0.5 * direct[:, 0] + 0.53 * found.arriving[0, ..., 0].ravel()
+    np.testing.assert_allclose(found.shown[0, ..., 0].ravel(), mixture[0] @ leaving, rtol=1e-3)

@@ -15,9 +15,6 @@ from embreex.mesh_construction import TriangleMesh
 BIAS = 1e-3
 """A point is in shadow of what lies nearer than its distance less this share: facets shade themselves not."""
 
-LIFT_MM = 0.01
-"""Mirrored rays start so far above the wall."""
-
 
 @dataclass(frozen=True)
 class Hits:
@@ -78,16 +75,6 @@ class Wall:
         return Hits(
             rays, self._mixed(self.vertices_mm, triangle, weights), unit(normals), self._place(triangle, u, v)
         )
-
-    def mirrored(self, hits: Hits, directions: np.ndarray) -> np.ndarray:
-        """Places float32 [N, 2] that the hits of rays with ``directions`` would show if they were mirrors."""
-        ray = directions[hits.rays]
-        aside = (ray * hits.normals).sum(axis=1, keepdims=True)
-        turned = ray - 2 * aside * hits.normals
-        far = self.cast(hits.points_mm + LIFT_MM * hits.normals, turned)
-        place = hits.place.copy()
-        place[far.rays] = far.place
-        return place
 
     def hit_triangle(self, origins_mm: np.ndarray, directions: np.ndarray) -> np.ndarray:
         """First triangle int [N] that rays [N, 3] meet; −1: none."""
