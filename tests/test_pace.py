@@ -41,7 +41,8 @@ def test_a_budget_that_is_spent_still_reads_one_photo_and_then_nothing():
 def test_light_that_is_found_again_beside_a_tone_curve_has_time_of_its_own_and_leaves_some_for_the_detail():
     pace = Pace(FitConfig(budget=100))
     once = pace.light_left
-    pace.find_light_again()
+    assert pace.find_light_again(took_s=60)
+    assert not pace.find_light_again(took_s=80)
     assert once + 20 < pace.light_left < pace.left(ITERATIONS) - 10
     assert not pace.light_is_over()
 
@@ -53,6 +54,14 @@ def test_light_may_take_all_that_the_detail_leaves_of_a_budget_but_never_has_les
     assert pace.light_left == pytest.approx(pace.left(ITERATIONS) - 20, abs=0.1)
     pace.leave(90)
     assert pace.light_left == pytest.approx(share, abs=1)
+
+
+def test_light_has_a_third_of_what_is_left_even_where_its_share_is_used_up():
+    pace = Pace(FitConfig(budget=0.5))
+    time.sleep(0.21)
+    assert pace.light_is_over()
+    pace.leave(90)
+    assert pace.light_left == pytest.approx(pace.left(ITERATIONS) / 3, abs=0.02)
 
 
 def test_the_detail_costs_what_the_lights_step_did_by_its_weights_its_pixels_and_its_steps():

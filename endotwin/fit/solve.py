@@ -20,6 +20,7 @@ from endotwin.effects import Decision, Effect, Effects
 from endotwin.errors import SequenceError
 from endotwin.evidence.decide import Decided, decide
 from endotwin.evidence.glints import Glints
+from endotwin.evidence.guide_search import Guides
 from endotwin.fit.bloom import bloom
 from endotwin.fit.faint import NOTHING, Faint
 from endotwin.fit.film import Found, Model
@@ -218,30 +219,28 @@ class _Fit:
     def light(self, pixels: _Pixels, start: Start) -> _Lighted:
         """The effects that the photos show, and light, response and coarse materials beside them; found again
         without a tone curve, if there is one. ``start`` is that of photos as they are."""
+        clock = self.pace.stopwatch
+        began = clock.total
         first = self._lighted(pixels, start)
         if first.found.toned is None:
             return first
-        began = self.pace.stopwatch.total
-        self.pace.find_light_again()
-        again = self._lighted(pixels, start, first)
-        return replace(again, again_s=self.pace.stopwatch.total - began)
+        found = clock.total
+        anew = self.pace.find_light_again(found - began)
+        again = self._lighted(pixels, start, first, anew)
+        return replace(again, again_s=clock.total - found)
 
-    def _lighted(self, pixels: _Pixels, start: Start, before: _Lighted | None = None) -> _Lighted:
+    def _lighted(
+        self, pixels: _Pixels, start: Start, before: _Lighted | None = None, anew: bool = True
+    ) -> _Lighted:
         """As ``light``; without the tone curve that was found ``before``, and near the guides beside which it
-        was."""
+        was, or with those effects unless they are to be found ``anew``."""
         samples, surface = pixels.samples, self.twin.surface
         toned, near_mm = None, AT_LENS
         if before is not None:
             toned, near_mm = before.found.toned, before.decided.effects.guides_mm or AT_LENS
         shown = samples if toned is None else samples.untoned(toned[0])
         with self.pace.stopwatch.stage("effects"):
-
-            def glints() -> Glints:
-                return Glints.of(shown[pixels.smooth], surface, start)
-
-            late, telling = self.pace.light_is_over, shown[pixels.telling]
-            with one_core():
-                decided = decide(telling, self.twin, self.caster, glints, self.states, late, near_mm)
+            decided = self._decided(pixels, shown, start, near_mm) if anew else before.decided
             if decided.light is not None or toned is not None:
                 start = _start_beside(decided, shown[pixels.start], surface)
             faint = NOTHING
@@ -258,6 +257,16 @@ class _Fit:
             stage = LightStage(*parts, surface, start, self.pace, relighting, wanted, self.device, found)
             self.pace.leave(stage.cost.detail_s(self._weights, len(samples), self.pace.plan.steps))
             return _Lighted(decided, start, relighting, stage.cost, stage.found())
+
+    def _decided(self, pixels: _Pixels, shown: Samples, start: Start, near_mm: Guides) -> Decided:
+        """The effects that photos which look as ``shown`` tell; guides are sought first ``near_mm``."""
+
+        def glints() -> Glints:
+            return Glints.of(shown[pixels.smooth], self.twin.surface, start)
+
+        late, telling = self.pace.light_is_over, shown[pixels.telling]
+        with one_core():
+            return decide(telling, self.twin, self.caster, glints, self.states, late, near_mm)
 
     def detail(self, lighted: _Lighted, samples: Samples) -> tuple[State, np.ndarray, Remains | None]:
         """The state with finer features on top, normals [V, 3] tilted as the photos show, and what is left of

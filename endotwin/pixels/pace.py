@@ -18,6 +18,10 @@ GATHER, LIGHT, LIGHT_AGAIN, ITERATIONS = 0.2, 0.4, 0.7, 0.92
 found and taken off the photos, for the light beside it, unless that leaves time for all of the detail, and no
 iteration begins."""
 
+LEAST_LIGHT = 1 / 3
+"""Share of what is left once the effects are decided that light's steps may have in any case: beside a light
+that was not found, no detail is right."""
+
 PIXELS_A_SECOND = 100_000
 """Pixels a second of budget: more would leave no time to fit them."""
 
@@ -39,7 +43,7 @@ class Pace:
         self.stopwatch = Stopwatch()
         self.report = report or (lambda label, done, total: None)
         self.budget_s = plan.budget or math.inf
-        self._light, self._detail_s = LIGHT, math.inf
+        self._light, self._light_end_s = LIGHT, LIGHT * self.budget_s
 
     @property
     def hurried(self) -> bool:
@@ -81,21 +85,24 @@ class Pace:
     @property
     def light_left(self) -> float:
         """Seconds until the light's steps should end, at least 0."""
-        if not self.hurried:
-            return math.inf
-        return max(self.left(self._light), self.left(ITERATIONS) - self._detail_s)
+        return max(0.0, self._light_end_s - self.stopwatch.total)
 
     def light_is_over(self) -> bool:
         """Whether the light's steps should end."""
         return not self.light_left
 
     def leave(self, detail_s: float) -> None:
-        """The light may have what is left beside ``detail_s``, seconds of all steps of the detail."""
-        self._detail_s = detail_s
+        """From here on light's steps have their share of the budget, or what is left beside ``detail_s``,
+        seconds of all steps of the detail, and LEAST_LIGHT of what is left in any case."""
+        now_s, end_s = self.stopwatch.total, ITERATIONS * self.budget_s
+        least_s = now_s + LEAST_LIGHT * self.left(ITERATIONS)
+        self._light_end_s = max(self._light * self.budget_s, end_s - detail_s, least_s)
 
-    def find_light_again(self) -> None:
-        """What has been found of the light was found beside photos under a tone curve: there is more time."""
-        self._light = LIGHT_AGAIN
+    def find_light_again(self, took_s: float) -> bool:
+        """What was found of the light, in ``took_s`` seconds, was found beside photos under a tone curve:
+        there is more time; whether as much as that."""
+        self._light, self._light_end_s = LIGHT_AGAIN, LIGHT_AGAIN * self.budget_s
+        return self.light_left >= took_s
 
     def out_of_time(self) -> bool:
         """Whether no iteration should begin any more."""
