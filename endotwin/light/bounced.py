@@ -96,7 +96,8 @@ class Bounce(Rows):
 
     Attributes:
         log, by_scale, by_gamma: float32 [N, 3]. by_n, by_q: float32 [N], the channels' mean.
-        gloss: float32 [N], share of what the points mirror that their white lobes send to the camera.
+        gloss: float32 [N], share of what the points mirror that their white lobes send to the camera; None:
+            nobody asked for it.
         surroundings: float32 [N, 3], radiosity of that over E; None: 1.
         shown: float32 [N, 3], γ·ln of the points' base colours that throw it; None: it follows no colours.
     """

@@ -21,9 +21,6 @@ from endotwin.surface.vectors import dot, frame_along, unit
 TURN = (math.sqrt(5) - 1) / 2
 """From facet to facet about the normal, of a full turn: the golden angle."""
 
-LIFT = 1e-3
-"""Mirrored rays start this share of the viewing distance above the surface."""
-
 HIGHEST = 1 - 1e-6
 """Share of facets that stand less steep than the steepest that is drawn."""
 
