@@ -42,7 +42,7 @@ def bounced(surface: Surface, points_mm: np.ndarray, normals: np.ndarray, poses:
     to_points = radiosity.to_points((points_mm - surface.origin_mm).astype(np.float32), normals)
     lamps = [radiosity.lamp(pose, np.zeros(3), COSINE) for pose in surface.to_local(poses)]
     direct = np.concatenate([radiosity.direct([lamp], N, Q) for lamp in lamps], axis=1)
-    found = radiosity.indirect(direct, np.full((radiosity.count, 3), ALBEDO))[..., 0]
+    found = radiosity.indirect(direct, np.full((radiosity.count, 3), ALBEDO))[: radiosity.count, :, 0]
     return (to_points @ found).T
 
 

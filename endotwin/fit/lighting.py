@@ -210,7 +210,7 @@ class Bouncer:
     """
 
     def __init__(self, surface: Surface, caster: Caster, effects: Effects, views: Views):
-        self._surface, self._caster, self.light_stays = surface, caster, False
+        self._surface, self.light_stays = surface, False
         self._placed: tuple[Tensor | None, Places | None] = None, None
         self._radiosity = Radiosity(surface, caster, effects["interreflection"].cell_mm)
         guides_mm = effects.guides_mm or AT_LENS

@@ -60,6 +60,7 @@ class Radiosity:
         self.shape = ((wall.shape[0] - 1) // BLOCK, wall.shape[1] // BLOCK)
         corners = wall.vertices_mm[wall.triangles]
         self._centres_mm = corners.mean(axis=1)
+        self._lift_mm = LIFT * float(np.ptp(self._centres_mm, axis=0).max())
         self._normals = unit(wall.doubled_area).astype(np.float32)
         self._area = area = np.sqrt((wall.doubled_area**2).sum(axis=1)) / 2
         self._triangles = self._of_blocks()
@@ -119,12 +120,11 @@ class Radiosity:
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Ways from directions ``to_end`` [N, 3] of triangles [N] by FACETS facets of each to other patches:
         which of the N, the patch, and its share of what lobes of ``roughness`` [P] reflect."""
-        lift_mm = LIFT * float(np.ptp(self._centres_mm, axis=0).max())
         each = np.repeat(np.arange(len(triangles)), FACETS)
         normals, draw = self._normals[triangles][each], rng.random((len(each), 2))
         rough = roughness[self.patch_of[triangles]][each]
         out, share = reflected(normals, to_end[each], rough, f0, draw[:, 0], draw[:, 1])
-        hit = self._wall.hit_triangle(self._centres_mm[triangles][each] + lift_mm * normals, out)
+        hit = self._wall.hit_triangle(self._centres_mm[triangles][each] + self._lift_mm * normals, out)
         landed = (hit >= 0) & (share > 0)
         return each[landed], self.patch_of[hit[landed]], share[landed] / FACETS
 
@@ -184,7 +184,6 @@ class Radiosity:
         cell = np.stack(np.divmod(np.arange(each), STRATA), axis=1)
         member = np.arange(each) % self._triangles.shape[1]
         repeats = each / self._triangles.shape[1]
-        scale_mm = float(np.ptp(self._centres_mm, axis=0).max())
         parts = []
         for first in range(0, count, AT_ONCE):
             patches = np.arange(first, min(first + AT_ONCE, count))
@@ -195,7 +194,7 @@ class Radiosity:
             draw = draw.reshape(-1, 4)
             normal = self._normals[triangle]
             direction = cosine_weighted(normal, draw[:, 0], draw[:, 1])
-            origin = inside(corners[triangle], draw[:, 2], draw[:, 3]) + LIFT * scale_mm * normal
+            origin = inside(corners[triangle], draw[:, 2], draw[:, 3]) + self._lift_mm * normal
             hit = self._wall.hit_triangle(origin, direction)
             landed = np.flatnonzero(hit >= 0)
             place = (np.repeat(patches - first, each)[landed], self.patch_of[hit[landed]])

@@ -72,7 +72,7 @@ def test_a_camera_at_a_spheres_centre_is_shown_the_other_side_by_smooth_facets()
 
 
 def test_cameras_see_what_leaves_patches_but_for_what_lobes_make_of_the_lamps_light() -> None:
-    """A single bounce between halves of albedo 0.5 that mirror each other's radiosity."""
+    """A sphere of albedo 0.5 whose patches show a camera the mixture of all that even light comes from."""
     wall = sphere(12)
     radiosity = Radiosity(wall, np.full((*wall.shape, 3), 0.5), np.random.default_rng(0))
     direct = radiosity.direct(Lamp(L0=700, n=1.5, q=2), np.eye(4))[:, None]
