@@ -1,4 +1,4 @@
-"""Tissue beneath glints: hidden materials are those about them, all others stay bit for bit."""
+"""Tissue that no photo tells goes on from what is about it; all other stays bit for bit."""
 
 from dataclasses import replace
 
@@ -12,7 +12,7 @@ import endotwin
 from endotwin.effects import Effects
 from endotwin.effects.film import Film as FilmEffect
 from endotwin.effects.specular import Specular
-from endotwin.fit.heal import healed
+from endotwin.fit.heal import extended, healed
 from endotwin.render import Renderer
 
 TUBE = test_film.tube(Effects([Specular()]))
@@ -47,6 +47,38 @@ def test_what_another_photo_shows_without_a_glint_stays():
     assert healed(state, TUBE.surface, samples, shines) is state
     nothing = torch.zeros(len(samples), dtype=torch.bool)
     assert healed(state, TUBE.surface, samples, nothing) is state
+
+
+def ring(vertices: np.ndarray, first: int, last: int) -> np.ndarray:
+    """Which of ``vertices`` lie in the rings ``first`` to ``last`` of the tube, which has 120 in each."""
+    return (vertices // 120 >= first) & (vertices // 120 <= last)
+
+
+def test_materials_go_on_from_what_photos_tell_as_heat_does():
+    """Around a tube as straight lines between two rings, evenly beyond the last; a piece of which no photo
+    tells any is as the mean of the rest."""
+    mesh = TUBE.surface.triangles
+    mesh = mesh[~ring(mesh, 150, 151).any(axis=1)]
+    surface = replace(TUBE.surface, triangles=mesh)
+    told = np.flatnonzero(ring(mesh, 20, 22).all(axis=1) | ring(mesh, 60, 62).all(axis=1))
+    one = tube_twin.photographed(TUBE, TUBE.camera, test_film.POSES[:1])[:1]
+    samples = replace(
+        one[torch.zeros(len(told), dtype=torch.int64)],
+        triangle=torch.from_numpy(told),
+        barycentric=torch.full((len(told), 3), 1 / 3),
+    )
+    state, number = tube_twin.state_of(TUBE), np.arange(len(TUBE.surface.vertices_mm))
+    at = torch.from_numpy(np.clip(number // 120, 20, 62) / 100).float()
+    true = torch.stack([at, 1 - at, 2 * at, at - 1], dim=1)
+    spoiled = torch.rand(true.shape, generator=torch.Generator().manual_seed(0))
+    known = torch.from_numpy(ring(number, 20, 22) | ring(number, 60, 62))
+    spoiled[known] = true[known]
+    found = extended(replace(state, operator=None, table=None, mean=spoiled), surface, samples).raw
+    joined, apart = (torch.from_numpy(ring(number, *rings)) for rings in ((0, 149), (152, 219)))
+    torch.testing.assert_close(found[known], true[known], rtol=0, atol=0)
+    torch.testing.assert_close(found[joined], true[joined], rtol=0, atol=1e-4)
+    mean = true[known].mean(dim=0)
+    torch.testing.assert_close(found[apart], mean.expand(int(apart.sum()), 4), rtol=0, atol=1e-3)
 
 
 @pytest.mark.slow

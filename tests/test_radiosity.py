@@ -82,6 +82,16 @@ def test_half_a_sphere_whose_wall_is_the_other_half_gets_the_bounce_of_the_whole
     assert bounced.shape == (half.count, 1, 3)
 
 
+def test_tissue_that_no_photo_saw_sends_back_as_much_as_what_was_seen_beside_it(hollow_sphere):
+    """E = E_direct·ρ/(1 − ρ), ρ that of the half that was seen, whatever the other's is taken for."""
+    albedo, upper = 0.6, (hollow_sphere.vertices_mm[:, 2] > 0).astype(np.int32)
+    half = hollow_sphere.with_coverage(upper, hollow_sphere.nearest_mm)
+    radiosity = Radiosity(half, Caster(half), cell_mm=3.0)
+    color = radiosity.mean(albedo * np.repeat(upper[half.triangles].min(axis=1)[:, None], 3, axis=1))
+    bounced = radiosity.indirect(np.ones((radiosity.count, 1), np.float32), color)
+    np.testing.assert_allclose(bounced, albedo / (1 - albedo), rtol=0.02)
+
+
 def test_nothing_of_the_wall_lies_in_the_way_of_light_to_the_surface(hollow_sphere):
     inner = replace(
         hollow_sphere,

@@ -26,6 +26,7 @@ from endotwin.fit.faint import NOTHING, Faint
 from endotwin.fit.film import Found, Model
 from endotwin.fit.gauss_newton import CPU, GaussNewton, unusual
 from endotwin.fit.hashgrid import HashGrid, HashOperator
+from endotwin.fit.heal import extended
 from endotwin.fit.light_stage import Cost, FoundLight, LightStage
 from endotwin.fit.lighting import Relighting
 from endotwin.fit.sparkle import sparkle
@@ -100,6 +101,7 @@ def fit_twin(
     with stopwatch.stage("detail"):
         samples = relighting.lit(samples)
         state, normals, remains = fit.detail(lighted, samples)
+        state = extended(state, surface, samples)
         twin = replace(twin, surface=replace(surface, normals=normals))
     wet, beyond, why = fit.beyond(Model(twin, state, relighting, fit.caster), samples)
     if odd := unusual(state.shared):

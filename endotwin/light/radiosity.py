@@ -98,15 +98,14 @@ class Radiosity:
         self._caster = caster
         self._lift_mm = LIFT * cell_mm
         generator = np.random.default_rng(seed)
-        whole, seen = _with_wall(surface), len(surface.triangles)
+        whole, own = _with_wall(surface), len(surface.triangles)
         corners = whole.vertices_mm[whole.triangles]
         normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         double_area = np.sqrt(dot(normal, normal))
         normal = normal / np.maximum(double_area, np.finfo(np.float32).tiny)[:, None]
-        self._area = double_area[:seen] / 2
         middle = np.einsum("nka->na", corners) / 3
         pieces = [
-            _patches(middle[k], normal[k], double_area[k] / 2, cell_mm) for k in (np.s_[:seen], np.s_[seen:])
+            _patches(middle[k], normal[k], double_area[k] / 2, cell_mm) for k in (np.s_[:own], np.s_[own:])
         ]
         self.patch_of = pieces[0]
         self.count = int(self.patch_of.max()) + 1
@@ -125,7 +124,11 @@ class Radiosity:
         centre_mm = _mean_of_points(self._points_mm)
         self.centre_mm = centre_mm[: self.count]
         self._facing = unit(_mean_of_points(self._normals[: self.count * POINTS]))
-        self._like = cKDTree(self.centre_mm).query(centre_mm[self.count :])[1]
+        told = (surface.seen_by > 0)[surface.triangles].all(axis=1)
+        told |= not told.any()
+        self._area = double_area[:own] / 2 * told
+        told = np.unique(self.patch_of[told])
+        self._like = told[cKDTree(self.centre_mm[told]).query(centre_mm)[1]]
         self._surface = surface
 
     def moved(self, caster: Caster) -> Radiosity:
@@ -270,11 +273,12 @@ class Radiosity:
         return total + added * (ratio / (1 - ratio))
 
     def walled(self, albedo: np.ndarray) -> np.ndarray:
-        """``albedo`` [P, C] of tissue, and of the wall's too: float32 [P + W, 1, C]."""
-        return np.concatenate([albedo, albedo[self._like]])[:, None].astype(np.float32)
+        """``albedo`` [P, C] of tissue where photos tell it, and elsewhere and on the wall that of the nearest
+        such patch: float32 [P + W, 1, C]."""
+        return albedo[self._like][:, None].astype(np.float32)
 
     def mean(self, per_triangle: np.ndarray) -> np.ndarray:
-        """Means over each patch's area, [P, C], of values [F, C]."""
+        """Means over what photos saw of each patch, [P, C], of values [F, C]; 0 where they saw nothing."""
         sums = [np.bincount(self.patch_of, self._area * column, self.count) for column in per_triangle.T]
         total = np.bincount(self.patch_of, self._area, self.count)
         return np.stack(sums, axis=1) / np.maximum(total, np.finfo(np.float64).tiny)[:, None]
