@@ -54,7 +54,8 @@ off a mesh errs by would bend it, and γ with it. L0 is told by the albedo's sca
 
 WORSE, HALVINGS = 1.25, 2
 """A step under whose light the photos cost so many times what they did is too long, and halved so often; by
-what varies no light is taken under which they cost so many times what they do under that of joint steps."""
+what varies no light is taken under which they cost so many times what they do under that of joint steps, and
+no coat beside which they cost so many times what they do without."""
 
 SETTLING = 4
 """Steps at most of the materials under a light that was found beside a bounce."""
@@ -220,8 +221,7 @@ class LightStage:
             scale = ("albedo scale",) * (number < HOLD_STEPS)
             self._solver.held = (*self._undetermined, *BOUNCE_HELD, *scale)
             if shared.coat:
-                within, material = self._within()
-                self._take(within.shone(material, shared, self._noise))
+                self._shine(shared)
             self._state, gain = self._stepped(self._state, joint=True)
             if too_dark(self._state):
                 self._state = self._relighting.without_bounce(self._solver, self._state)
@@ -363,6 +363,19 @@ class LightStage:
         highlights = seen.highlights(material, state.shared, self._noise)
         layer, self._decisions["coat"] = judged_coat(highlights, self._wanted["coat"])
         return replace(state.shared, coat=layer)
+
+    def _shine(self, shared: Globals) -> None:
+        """Take ``shared`` with the f0, coat and roughness that all pixels ask for; or leave off a coat that
+        is new, beside which they are plainly worse: highlights alone have found it."""
+        before, noise = self._state, self._noise
+        within, material = self._within()
+        self._take(within.shone(material, shared, noise))
+        if before.shared.coat is not None or self._wanted["coat"] == "on":
+            return
+        if self._solver.cost(self._state, noise) > WORSE * self._solver.cost(before, noise):
+            self._state, coat = before, self._decisions["coat"]
+            reason = f"{coat.reason}, but beside it all pixels are plainly worse"
+            self._decisions["coat"] = replace(coat, state="off", reason=reason)
 
     def _better(self, best: Best | None) -> Best:
         """The state, by which the samples are lit, or the ``best`` so far if that costs less."""
