@@ -9,6 +9,9 @@ from independent.scene import EFFECTS, Scene
 from independent.write import make
 
 import endotwin
+from endotwin.effects import Decision
+from endotwin.effects.coat import Coat
+from endotwin.fit import light_stage
 from endotwin.twin import Twin
 
 
@@ -26,3 +29,16 @@ def test_a_fit_finds_what_a_scene_has_and_nothing_else(tmp_path: Path, seed: int
     assert {name for name in EFFECTS if twin.decisions[name].state == "on"} == effects
     assert all(shown["levels"] > 1 for shown in made["shown"].values())
     assert twin.response.gamma == pytest.approx(made["gamma"], rel=0.04)
+
+
+@pytest.mark.slow
+def test_a_haze_brighter_than_water_is_no_coat_beside_a_bounce(tmp_path: Path, monkeypatch) -> None:
+    """Whatever the highlights say: all pixels of such tissue are worse with it."""
+    said = Decision("on", "the highlights say so", 1.1)
+    haze = Coat(weight=7.0, roughness=0.32, tail=1.0)
+    monkeypatch.setattr(light_stage, "judged_coat", lambda highlights, wanted: (haze, said))
+    twin, made = fitted(tmp_path, 224, {"interreflection"})
+    assert "interreflection" in twin.effects and "coat" not in twin.effects
+    assert twin.decisions["coat"].state == "off" and said.reason in twin.decisions["coat"].reason
+    assert twin.response.gamma == pytest.approx(made["gamma"], rel=0.1)
+    assert endotwin.evaluate(twin).psnr_covered > 30
