@@ -199,9 +199,8 @@ class Evaluation:
 
 def covered_pixels(hits: Correspondences, surface: Surface, shape: tuple[int, int]) -> np.ndarray:
     """Bool [H, W]: pixels whose hit triangle has only vertices that a training photo saw."""
-    seen_triangle = (surface.seen_by > 0)[surface.triangles].all(axis=1)
     covered = np.zeros(shape[0] * shape[1], bool)
-    covered[hits.pixel] = seen_triangle[hits.triangle]
+    covered[hits.pixel] = surface.seen()[hits.triangle]
     return covered.reshape(shape)
 
 

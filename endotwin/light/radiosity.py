@@ -124,10 +124,10 @@ class Radiosity:
         centre_mm = _mean_of_points(self._points_mm)
         self.centre_mm = centre_mm[: self.count]
         self._facing = unit(_mean_of_points(self._normals[: self.count * POINTS]))
-        told = (surface.seen_by > 0)[surface.triangles].all(axis=1)
-        told |= not told.any()
-        self._area = double_area[:own] / 2 * told
-        told = np.unique(self.patch_of[told])
+        seen = surface.seen()
+        seen |= not seen.any()
+        self._area = double_area[:own] / 2 * seen
+        told = np.unique(self.patch_of[seen])
         self._like = told[cKDTree(self.centre_mm[told]).query(centre_mm)[1]]
         self._surface = surface
 

@@ -74,6 +74,10 @@ class Surface:
         normals = self.normals[self.triangles]
         return np.einsum("fik,fik->fi", normals, np.roll(normals, 1, axis=1)).min(axis=1)
 
+    def seen(self) -> np.ndarray:
+        """Triangles of which training photos saw all corners, bool [F]."""
+        return (self.seen_by > 0)[self.triangles].all(axis=1)
+
     def with_coverage(self, seen_by: np.ndarray, nearest_mm: np.ndarray) -> Surface:
         """The same surface with other coverage [V] each."""
         return replace(self, seen_by=seen_by, nearest_mm=nearest_mm)

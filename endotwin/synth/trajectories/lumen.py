@@ -60,9 +60,8 @@ class Lumen:
         a, b, c = (surface.vertices_mm[surface.triangles[:, k]] for k in range(3))
         self._facing = unit(np.cross(b - a, c - a))
         self._sphere = fibonacci_sphere(SPHERE_RAYS)
-        corners = surface.triangles
-        self._filled = surface.filled[corners].any(axis=1)
-        self._unseen = (surface.seen_by == 0)[corners].any(axis=1) & ~self._filled & surface.seen_by.any()
+        self._filled = surface.filled[surface.triangles].any(axis=1)
+        self._unseen = ~surface.seen() & ~self._filled & surface.seen_by.any()
 
     @cached_property
     def _caster(self) -> Caster:
