@@ -28,11 +28,12 @@ def inserted(page: str, section: str, printed: str, by: int = 0) -> str:
 
 def merged(old: list[str], new: list[str], by: int) -> list[str]:
     """The lines of the table ``old`` with those of ``new`` for rows that begin with the same ``by`` cells;
-    further ones at the end. ``new`` alone where ``by`` is 0, or where the columns are not the same."""
+    further ones at the end. ``new`` alone where ``by`` is 0, or where the columns are not the same. Its head
+    may come again, as from several commands."""
     if not by or old[:1] != new[:1]:
         return new
     rows = {key(line, by): line for line in old[2:]}
-    rows |= {key(line, by): line for line in new[2:]}
+    rows |= {key(line, by): line for line in new if line not in new[:2]}
     return [*new[:2], *rows.values()]
 
 
