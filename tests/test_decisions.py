@@ -32,6 +32,16 @@ def test_a_fit_finds_what_a_scene_has_and_nothing_else(tmp_path: Path, seed: int
 
 
 @pytest.mark.slow
+def test_the_strength_of_a_bounce_off_pale_tissue_is_found(tmp_path: Path) -> None:
+    """The 98th percentile of its red is 0.85, not far below a furnace."""
+    twin, made = fitted(tmp_path, 237, {"interreflection"})
+    assert twin.light.L0 == pytest.approx(made["L0"], rel=0.1)
+    assert twin.light.n == pytest.approx(made["n"], rel=0.1)
+    assert twin.response.gamma == pytest.approx(made["gamma"], rel=0.03)
+    assert endotwin.evaluate(twin).psnr_covered > 38
+
+
+@pytest.mark.slow
 def test_a_haze_brighter_than_water_is_no_coat_beside_a_bounce(tmp_path: Path, monkeypatch) -> None:
     """Whatever the highlights say: all pixels of such tissue are worse with it."""
     said = Decision("on", "the highlights say so", 1.1)

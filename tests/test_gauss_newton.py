@@ -14,7 +14,6 @@ from endotwin.effects.specular import Specular
 from endotwin.fit.gauss_newton import BOUNCE_ERROR, STANDARD_SPREAD, TEMPER, GaussNewton, unusual
 from endotwin.fit.model import Globals
 from endotwin.fit.state import (
-    BRIGHTEST,
     DARKEST,
     GLOBAL_RANGE,
     State,
@@ -25,6 +24,7 @@ from endotwin.fit.state import (
     too_dark,
     without_furnace,
 )
+from endotwin.light.radiosity import ALBEDO_MAX
 from endotwin.twin import Light, Response
 
 
@@ -80,8 +80,17 @@ def test_a_step_that_leaves_room_ends_below_the_furnace(step):
     state = colored(0.8, 0.0)
     share = room_below_furnace(state, step)
     moved = rescaled(state, share * step)
-    assert 0 < share <= 1 and brightest(moved) * math.exp(moved.shared.log_scale) <= BRIGHTEST * (1 + 1e-6)
+    assert 0 < share <= 1 and brightest(moved) * math.exp(moved.shared.log_scale) <= ALBEDO_MAX * (1 + 1e-6)
     assert room_below_furnace(without_furnace(colored(0.8, 2.0)), 0.1) < 1e-6
+
+
+@pytest.mark.parametrize("unseen", [0.5, 20.0])
+def test_tissue_that_no_photo_shows_neither_limits_the_bounce_nor_counts_in_what_a_step_keeps(unseen):
+    told = torch.arange(100) < 60
+    before, after = (replace(colored(factor, 0.1), told=told) for factor in (0.8, 1.1))
+    strange = replace(after, mean=torch.where(told[:, None], after.mean, unseen * after.mean))
+    assert brightest(strange) == brightest(after) != brightest(replace(strange, told=None))
+    assert as_bouncing(strange, before).shared.log_scale == as_bouncing(after, before).shared.log_scale
 
 
 def test_tissue_is_too_dark_by_what_it_reflects_not_by_its_scale():

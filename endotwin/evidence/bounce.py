@@ -61,12 +61,12 @@ def bounced(probe: Probe, hypothesis: Hypothesis) -> Bounced:
     def under(brightest: float) -> Bounced:
         light_there = direct_light
         for _ in range(FIXED_POINT_ROUNDS):
-            base_color, L0 = _patch_albedo(linear, light_there, patch, radiosity.count, brightest)
+            base_color = _patch_albedo(linear, light_there, patch, radiosity.count, brightest)
             albedo = Albedo(base_color, glossy)
             light_there = direct_light + seen(light.at(places, n, q, albedo.scaled(0.0)), base_color)
         found = light.expanded(places, n, q, albedo, by=("n", "q"))
         log = np.log(np.maximum(seen(found.irradiance(n, q).numpy(), base_color), 1e-30))
-        return Bounced(log, found.by_n.numpy(), found.by_q.numpy(), L0)
+        return Bounced(log, found.by_n.numpy(), found.by_q.numpy())
 
     tried = [under(brightest) for brightest in PROBE_ALBEDOS]
     models = [probe.fit(replace(hypothesis, bounced=each)) for each in tried]
@@ -76,13 +76,12 @@ def bounced(probe: Probe, hypothesis: Hypothesis) -> Bounced:
 
 def _patch_albedo(
     linear: np.ndarray, light: np.ndarray, patch: np.ndarray, count: int, brightest: float
-) -> tuple[np.ndarray, float]:
-    """Least-squares albedo [P, 3] of patches from linear photo values [N, 3] under ``light`` [N] for L0 =
-    1, with ``brightest`` as its scale (the median where no pixel is); and the L0 that this scale asks for."""
+) -> np.ndarray:
+    """Least-squares albedo [P, 3] of patches from linear photo values [N, 3] under ``light`` [N], with
+    ``brightest`` as its scale; the median where no pixel is."""
     weight = np.bincount(patch, light * light, count)
     sums = np.stack([np.bincount(patch, light * channel, count) for channel in linear.T], axis=1)
     seen = weight > 0
     albedo = np.where(seen[:, None], sums / np.where(seen, weight, 1)[:, None], 0)
     albedo[~seen] = np.median(albedo[seen], axis=0)
-    scale = brightest / float(np.percentile(albedo[seen].max(axis=1), 98))
-    return albedo * scale, 1 / (2 * scale)
+    return albedo * brightest / float(np.percentile(albedo[seen].max(axis=1), 98))

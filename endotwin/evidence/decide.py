@@ -43,7 +43,7 @@ from endotwin.light.guides import AT_LENS, COSINE, EXPONENTIAL
 from endotwin.pixels.samples import Samples
 from endotwin.pixels.start import PRIOR
 from endotwin.surface.casting import Caster
-from endotwin.twin import Light, Twin
+from endotwin.twin import Twin
 
 TOGETHER = ("offset", "interreflection", "gain")
 BESIDE = ("profile", "vignetting")
@@ -68,15 +68,13 @@ class Decided:
 
     Attributes:
         effects: those that are on, with parameters. decisions: of every fitted effect, by name.
-        light: where the fit starts instead of at the closed form, which is right for a light at the lens
-            alone; None where that is what it is, L0 = 0 where nothing tells its strength. gamma: the
-            response to start with.
+        start: n, q and γ from which the fit starts instead of the closed form, which is right for a light at
+            the lens alone; None where that is what it is.
     """
 
     effects: Effects
     decisions: dict[str, Decision]
-    light: Light | None
-    gamma: float
+    start: tuple[float, float, float] | None
 
 
 def decide(
@@ -242,11 +240,9 @@ class _Trial:
         }
         effects = self._effects(kept)
         if "interreflection" in effects:
-            light = Light(kept.hypothesis.bounced.L0, PRIOR["n"], PRIOR["q"])
-            return Decided(effects, decisions, light, PRIOR["gamma"])
+            return Decided(effects, decisions, (PRIOR["n"], PRIOR["q"], PRIOR["gamma"]))
         plain = not set(effects) - {"specular"}
-        n, q, gamma = kept.start
-        return Decided(effects, decisions, None if plain else Light(0.0, n, q), gamma)
+        return Decided(effects, decisions, None if plain else kept.start)
 
     def _sets(self, names: Iterable[str]) -> list[frozenset[str]]:
         """All sets of the effects ``names`` that are wanted, in which those that are forced are on."""

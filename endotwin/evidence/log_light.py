@@ -32,16 +32,14 @@ class Bounced:
     Attributes:
         log: float32 [N], at the priors of n and q. by_n, by_q: float32 [N], its derivatives by the light's
             n and q.
-        L0: of a light under which tissue of the usual albedo looks as bright as in the photos.
     """
 
     log: np.ndarray
     by_n: np.ndarray
     by_q: np.ndarray
-    L0: float
 
     def __getitem__(self, rows: np.ndarray) -> Bounced:
-        return Bounced(self.log[rows], self.by_n[rows], self.by_q[rows], self.L0)
+        return Bounced(self.log[rows], self.by_n[rows], self.by_q[rows])
 
     def at(self, n: float, q: float) -> np.ndarray:
         """ln of the irradiance [N] under another n and q, to first order about their priors."""

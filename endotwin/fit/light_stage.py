@@ -24,7 +24,17 @@ from endotwin.fit.hashgrid import HashGrid, HashOperator
 from endotwin.fit.lighting import Relighting
 from endotwin.fit.mixing import Mixing
 from endotwin.fit.model import Globals, at_pixels
-from endotwin.fit.state import State, as_bouncing, halfway, mixed, roughness_to_raw, too_dark, without_furnace
+from endotwin.fit.state import (
+    State,
+    as_bouncing,
+    brightest,
+    halfway,
+    mixed,
+    rescaled,
+    roughness_to_raw,
+    too_dark,
+    without_furnace,
+)
 from endotwin.fit.within import Renewed, Within
 from endotwin.light.shading import F0_DIELECTRIC, ROUGHNESS_TISSUE
 from endotwin.pixels.length_unit import unit_mm
@@ -41,6 +51,10 @@ PROXIES = 4
 
 STEPS, BOUNCE_STEPS = 6, 10
 """Steps at most, and those where light bounces."""
+
+PALE = 0.75
+"""Brightest channel of the even tissue from which the strength of a bounce is sought: it is found in fewer
+steps from above than from below."""
 
 HOLD_STEPS = 1
 """Before these the scale of the albedo, which tells how light bounces, is held."""
@@ -175,7 +189,7 @@ class LightStage:
             shared = replace(before.state.shared, tone=tone)
             self._state = replace(before.state, operator=operator, shared=shared)
         else:
-            self._state = _started(operator, start, relighting, tone)
+            self._state = _started(operator, start, relighting, tone, self._solver.pattern.told)
         relighting(self._solver, self._state)
         ready = pace.stopwatch.total
         self._state, _ = self._stepped(self._state, joint=False)
@@ -230,6 +244,9 @@ class LightStage:
                 best = self._better(best)
             number = self._next(number, BOUNCE_STEPS, gain, BOUNCE_COAT_STEP)
         if best is not None:
+            if not self._late:
+                self._settle()
+                best = self._better(best)
             self._take_best(self._by_what_varies(best))
         self._without_faint((*self._undetermined, *BOUNCE_HELD, "albedo scale", "gamma"))
         return None
@@ -366,16 +383,20 @@ class LightStage:
 
     def _shine(self, shared: Globals) -> None:
         """Take ``shared`` with the f0, coat and roughness that all pixels ask for; or leave off a coat that
-        is new, beside which they are plainly worse: highlights alone have found it."""
+        is new, and that they give no weight or are plainly worse beside: highlights alone have found it."""
         before, noise = self._state, self._noise
         within, material = self._within()
         self._take(within.shone(material, shared, noise))
         if before.shared.coat is not None or self._wanted["coat"] == "on":
             return
-        if self._solver.cost(self._state, noise) > WORSE * self._solver.cost(before, noise):
-            self._state, coat = before, self._decisions["coat"]
-            reason = f"{coat.reason}, but beside it all pixels are plainly worse"
-            self._decisions["coat"] = replace(coat, state="off", reason=reason)
+        if self._state.shared.coat.weight == 0:
+            flaw = "all pixels give it no weight"
+        elif self._solver.cost(self._state, noise) > WORSE * self._solver.cost(before, noise):
+            flaw = "beside it all pixels are plainly worse"
+        else:
+            return
+        self._state, coat = before, self._decisions["coat"]
+        self._decisions["coat"] = replace(coat, state="off", reason=f"{coat.reason}, but {flaw}")
 
     def _better(self, best: Best | None) -> Best:
         """The state, by which the samples are lit, or the ``best`` so far if that costs less."""
@@ -425,13 +446,16 @@ def _steady(before: Globals, after: Globals) -> bool:
     return all(abs(now - was) < STEADY * max(was, STEADY) for was, now in pairs)
 
 
-def _started(operator: HashOperator, start: Start, relighting: Relighting, tone: Tone | None) -> State:
-    """Even tissue under the light of ``start``."""
+def _started(
+    operator: HashOperator, start: Start, relighting: Relighting, tone: Tone | None, told: torch.Tensor
+) -> State:
+    """Even tissue under the light of ``start``, for photos that tell of the vertices ``told``, bool [V]."""
     shown = torch.from_numpy(start.base_color) ** start.response.gamma
     mean = torch.cat([shown.median(dim=0).values, torch.tensor([roughness_to_raw(ROUGHNESS_TISSUE)])])
     options = {"specular": "specular" in relighting.effects, "bounce": relighting.bounces}
     shared = replace(Globals.of(start.light, start.response, F0_DIELECTRIC, **options), tone=tone)
-    return State(operator, mean, torch.zeros(operator.forward_csr.shape[1], 4), shared)
+    state = State(operator, mean, torch.zeros(operator.forward_csr.shape[1], 4), shared, told)
+    return rescaled(state, math.log(PALE / brightest(state))) if relighting.bounces else state
 
 
 def proxies(vertices_mm: np.ndarray, cell_mm: float) -> tuple[np.ndarray, np.ndarray]:

@@ -73,6 +73,13 @@ class MeshPattern:
         pointers = np.searchsorted(row, np.arange(vertex_count + 1))
         self._pointers, self._indices = (torch.from_numpy(x.astype(np.int32)) for x in (pointers, column))
 
+    @property
+    def told(self) -> Tensor:
+        """Bool [V], corners of triangles that samples show."""
+        told = torch.zeros(self.vertex_count, dtype=torch.bool)
+        told[torch.from_numpy(self.corners.ravel()).long()] = True
+        return told
+
     def matrix(self, pair_sums: np.ndarray) -> Tensor:
         """Symmetric CSR [V, V] from sums [T, 6] of weighted products of barycentrics, by CORNER_PAIRS."""
         values = pair_sums.reshape(-1)[self._entry]

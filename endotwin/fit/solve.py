@@ -243,7 +243,7 @@ class _Fit:
         shown = samples if toned is None else samples.untoned(toned[0])
         with self.pace.stopwatch.stage("effects"):
             decided = self._decided(pixels, shown, start, near_mm) if anew else before.decided
-            if decided.light is not None or toned is not None:
+            if decided.start is not None or toned is not None:
                 start = _start_beside(decided, shown[pixels.start], surface)
             faint = NOTHING
             if not start.undetermined:
@@ -357,9 +357,9 @@ class _Fit:
 def _start_beside(decided: Decided, shown: Samples, surface: Surface) -> Start:
     """Where the fit starts beside the effects that are ``decided``, from what is ``shown``."""
     mesh = surface.triangles, len(surface.vertices_mm)
-    if decided.light is None:
+    if decided.start is None:
         return closed_form(shown, *mesh)
-    return start_at(shown, *mesh, decided.light, decided.gamma)
+    return start_at(shown, *mesh, *decided.start)
 
 
 def _without_bounce(decision: Decision) -> Decision:

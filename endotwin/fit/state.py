@@ -14,6 +14,7 @@ from torch import Tensor
 from endotwin.fit.hashgrid import HashOperator
 from endotwin.fit.mixing import Mixing
 from endotwin.fit.model import Globals
+from endotwin.light.radiosity import ALBEDO_MAX
 
 ROUGHNESS_RANGE = (0.08, 1.0)
 
@@ -24,22 +25,23 @@ at the clamp, beyond which no step finds a lower cost."""
 GLOBAL_RANGE = ((-20.0, 20.0), (0.0, 10.0), (0.0, 4.0), (0.15, 1.5), (-6.0, -0.7), (-4.0, 4.0))
 """Bounds of the shared parameters, in the order of BOUNCE_GLOBALS."""
 
-DARKEST, BRIGHTEST = 0.24, 0.9
-"""Shares of the light between which the brightest tissue (98th percentile) reflects: less is asked for where
-no light bounces; more where a mesh lacks what throws light on it, until the tissue would be a furnace."""
+DARKEST = 0.24
+"""Share of the light that the brightest tissue (98th percentile) reflects at least. Less is asked for where
+no light bounces, and more than ALBEDO_MAX where a mesh lacks what throws light on it."""
 
 
 @dataclass(frozen=True)
 class State:
     """What is fitted: table [R, 4] of one operator, its mean [4] or [V, 4], and the shared parameters.
 
-    Without an operator the mean is all there is.
+    Without an operator the mean is all there is. ``told``: bool [V], vertices that photos tell of; None: all.
     """
 
     operator: HashOperator | None
     mean: Tensor
     table: Tensor | None
     shared: Globals
+    told: Tensor | None = None
 
     @cached_property
     def raw(self) -> Tensor:
@@ -60,6 +62,12 @@ class State:
             [self._shown(raw) ** (1 / self.shared.gamma), low + (high - low) * torch.sigmoid(raw[:, 3:])],
             dim=1,
         )
+
+    @property
+    def told_color(self) -> Tensor:
+        """Base colour of the vertices that photos tell of, [N, 3]: what others hold is no tissue's."""
+        color = self.materials[:, :3]
+        return color if self.told is None else color[self.told]
 
     @cached_property
     def link_slope(self) -> Tensor:
@@ -95,20 +103,20 @@ def too_dark(state: State) -> bool:
 
 
 def without_furnace(state: State) -> State:
-    """``state`` with the albedo's scale such that the brightest tissue reflects at most BRIGHTEST."""
-    limit = math.log(BRIGHTEST / brightest(state))
+    """``state`` with the albedo's scale such that the brightest tissue reflects at most ALBEDO_MAX."""
+    limit = math.log(ALBEDO_MAX / brightest(state))
     return state if state.shared.log_scale <= limit else rescaled(state, limit)
 
 
 def room_below_furnace(state: State, step: float) -> float:
     """The share of a ``step`` of the albedo's log scale, at most 1, after which the tissue is no furnace."""
-    room = math.log(BRIGHTEST / brightest(state)) - state.shared.log_scale
+    room = math.log(ALBEDO_MAX / brightest(state)) - state.shared.log_scale
     return 1.0 if step <= room else max(room, 0.0) / step
 
 
 def brightest(state: State) -> float:
     """98th percentile of the brightest albedo channel, unscaled."""
-    return float(np.percentile(state.materials[:, :3].amax(dim=1).cpu().numpy(), 98))
+    return float(np.percentile(state.told_color.amax(dim=1).cpu().numpy(), 98))
 
 
 def as_bouncing(state: State, before: State) -> State:
@@ -118,8 +126,8 @@ def as_bouncing(state: State, before: State) -> State:
     the colours have gained since would bounce on top, and scale and colours would swing against each other
     from step to step.
     """
-    old = replace(before, shared=state.shared).materials[:, :3]
-    gained = (state.materials[:, :3].mean(dim=0) / old.mean(dim=0)).log().mean()
+    old = replace(before, shared=state.shared).told_color
+    gained = (state.told_color.mean(dim=0) / old.mean(dim=0)).log().mean()
     return rescaled(state, state.shared.log_scale - float(gained))
 
 

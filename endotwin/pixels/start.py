@@ -72,28 +72,29 @@ def closed_form(samples: Samples, triangles: np.ndarray, vertex_count: int) -> S
     """
     vertex = samples.nearest(triangles)
     gamma, n, q, undetermined = _coefficients(samples, vertex, vertex_count)
-    return _start(samples, vertex, vertex_count, Light(0.0, n, q), gamma, undetermined)
+    return _start(samples, vertex, vertex_count, n, q, gamma, undetermined)
 
 
-def start_at(samples: Samples, triangles: np.ndarray, vertex_count: int, light: Light, gamma: float) -> Start:
-    """A start from a given light and response, as ``closed_form`` returns it; an L0 of 0 is chosen as
-    there."""
-    vertex = samples.nearest(triangles)
-    return _start(samples, vertex, vertex_count, light, gamma, ())
+def start_at(
+    samples: Samples, triangles: np.ndarray, vertex_count: int, n: float, q: float, gamma: float
+) -> Start:
+    """A start from given n, q and γ, as ``closed_form`` returns it."""
+    return _start(samples, samples.nearest(triangles), vertex_count, n, q, gamma, ())
 
 
 def _start(
     samples: Samples,
     vertex: np.ndarray,
     vertex_count: int,
-    light: Light,
+    n: float,
+    q: float,
     gamma: float,
     undetermined: tuple[str, ...],
 ) -> Start:
-    base_color = _albedo(samples, vertex, vertex_count, Light(1.0, light.n, light.q), gamma)
-    scale = light.L0 or np.median(base_color.max(axis=1)) / ALBEDO_MIDDLE
+    base_color = _albedo(samples, vertex, vertex_count, Light(1.0, n, q), gamma)
+    scale = np.median(base_color.max(axis=1)) / ALBEDO_MIDDLE
     return Start(
-        Light(float(scale), light.n, light.q),
+        Light(float(scale), n, q),
         Response(gamma),
         (base_color / scale).astype(np.float32),
         undetermined,
