@@ -35,7 +35,7 @@ def test_a_fit_finds_what_a_scene_has_and_nothing_else(tmp_path: Path, seed: int
 def test_the_strength_of_a_bounce_off_pale_tissue_is_found(tmp_path: Path) -> None:
     """The 98th percentile of its red is 0.85, not far below a furnace."""
     twin, made = fitted(tmp_path, 237, {"interreflection"})
-    assert twin.light.L0 == pytest.approx(made["L0"], rel=0.1)
+    assert twin.light.L0 / made["L0"] == pytest.approx(1, rel=0.1)
     assert twin.light.n == pytest.approx(made["n"], rel=0.1)
     assert twin.response.gamma == pytest.approx(made["gamma"], rel=0.03)
     assert endotwin.evaluate(twin).psnr_covered > 38
