@@ -76,9 +76,7 @@ class MeshPattern:
     @property
     def told(self) -> Tensor:
         """Bool [V], corners of triangles that samples show."""
-        told = torch.zeros(self.vertex_count, dtype=torch.bool)
-        told[torch.from_numpy(self.corners.ravel()).long()] = True
-        return told
+        return torch.from_numpy(np.bincount(self.corners.ravel(), minlength=self.vertex_count) > 0)
 
     def matrix(self, pair_sums: np.ndarray) -> Tensor:
         """Symmetric CSR [V, V] from sums [T, 6] of weighted products of barycentrics, by CORNER_PAIRS."""
