@@ -42,6 +42,14 @@ def test_the_strength_of_a_bounce_off_pale_tissue_is_found(tmp_path: Path) -> No
 
 
 @pytest.mark.slow
+def test_a_response_that_no_display_has_is_found_where_light_bounces(tmp_path: Path) -> None:
+    """What the model errs by says how far photos are believed, and it is little here."""
+    twin, made = fitted(tmp_path, 144, {"interreflection"})
+    assert made["gamma"] > 0.53
+    assert twin.response.gamma == pytest.approx(made["gamma"], rel=0.05)
+
+
+@pytest.mark.slow
 def test_a_haze_brighter_than_water_is_no_coat_beside_a_bounce(tmp_path: Path, monkeypatch) -> None:
     """Whatever the highlights say: all pixels of such tissue are worse with it."""
     said = Decision("on", "the highlights say so", 1.1)

@@ -11,7 +11,7 @@ import tube_twin
 from endotwin.effects import Effects
 from endotwin.effects.interreflection import Interreflection
 from endotwin.effects.specular import Specular
-from endotwin.fit.gauss_newton import BOUNCE_ERROR, STANDARD_SPREAD, TEMPER, GaussNewton, unusual
+from endotwin.fit.gauss_newton import FIRST_ERROR, PASSING, STANDARD_SPREAD, TEMPER, GaussNewton, unusual
 from endotwin.fit.model import Globals
 from endotwin.fit.state import (
     DARKEST,
@@ -113,15 +113,13 @@ def explained(gamma: float, bounces: bool) -> tuple[GaussNewton, State]:
 
 
 @pytest.mark.parametrize("bounces", [False, True])
-def test_a_response_off_the_displays_costs_an_error_of_a_level_a_deviation_where_light_bounces(
-    monkeypatch, bounces
-):
+def test_a_response_off_the_displays_costs_what_the_model_errs_by_a_deviation_where_light_bounces(bounces):
     solver, state = explained(0.4, bounces)
     noise = 2 / 255
     cost = solver.cost(state, noise)
-    monkeypatch.setattr("endotwin.fit.gauss_newton.BOUNCE_ERROR", 0.0)
+    solver.errs_by = 0.0
     deviations = (0.4 - 1 / 2.2) / STANDARD_SPREAD
-    expected = bounces * len(solver.samples) * (deviations * BOUNCE_ERROR / noise) ** 2 / (2 * TEMPER)
+    expected = bounces * len(solver.samples) * (deviations * FIRST_ERROR / noise) ** 2 / (2 * TEMPER)
     assert cost - solver.cost(state, noise) == pytest.approx(expected, rel=1e-6)
 
 
@@ -129,3 +127,29 @@ def test_a_step_from_photos_that_are_explained_takes_the_response_towards_that_o
     solver, state = explained(0.4, bounces=True)
     found = solver.step(state)
     assert found.fell > 0 and 0.402 < found.state.shared.gamma < 1 / 2.2
+
+
+def test_what_a_model_errs_by_is_what_many_pixels_share_whatever_the_noise():
+    solver, state = explained(0.4, bounces=True)
+    generator, shown = np.random.default_rng(0), solver.samples.color.float()
+    view = solver.samples.views
+    row, column = np.divmod(solver.samples.pixel.numpy(), view.camera.width)
+    edge = math.ceil(view.camera.width / 16)
+    signs = generator.choice([-1.0, 1.0], (view.camera.height, view.camera.width))
+
+    def known(error: float, noise: float) -> float:
+        off = error * signs[row // edge, column // edge] + generator.normal(0, noise, len(row))
+        colors = (shown + torch.from_numpy(off)[:, None]).round().clamp(0, 255)
+        solver.relight(replace(solver.samples, color=colors.to(torch.uint8)))
+        solver.errs_by = 1.0
+        solver.learn_error(state)
+        return 255 * solver.errs_by
+
+    assert known(3.0, 4.0) == pytest.approx(3 * PASSING**0.5, rel=0.1)
+    assert known(0.0, 4.0) < 0.5 * PASSING**0.5
+    solver.learn_error(state)
+    least = solver.errs_by
+    known(3.0, 4.0)
+    solver.errs_by = least
+    solver.learn_error(state)
+    assert solver.errs_by == least

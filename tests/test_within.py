@@ -1,6 +1,5 @@
 """Light, response and f0 from the variation within vertices, whatever the tissue's texture."""
 
-import math
 from dataclasses import replace
 
 import numpy as np
@@ -252,66 +251,15 @@ def test_under_a_coat_that_shines_a_clipped_photo_says_at_least():
     assert not len(seen(0.5, 1e9))
 
 
-def told_by_colours(true: Globals, lacking: float = 0.0) -> tuple[float, np.ndarray, np.ndarray]:
-    """γ and the gains that are found where all of a frame is lit alike, so that its gain passes for its light
-    and only how red that is remains; and the true gains. The bounce that is known is the true one to the
-    power of 1 + ``lacking``."""
-    generator = np.random.default_rng(4)
-    within, material = photographed()
-    frame, count = within.samples.frame.long(), len(within.samples)
-    material[:, :3] = material[:, :3].clamp_max(0.5)
-    tint = torch.tensor([0.6, 0.25, 0.15]) * torch.from_numpy(generator.uniform(0.05, 1, (SIGHTINGS, 1)))
-    log, none = torch.log(tint)[frame], torch.zeros(count)
-    bounces = [
-        Bounce(each - 2.2 * np.log(20.0), none, none, torch.ones(count, 3), torch.zeros(count, 3), none)
-        for each in (log, (1 + lacking) * log)
-    ]
-    gain = torch.from_numpy(generator.normal(0, 0.2, SIGHTINGS))
-    even = {"cos": 0.5 + none, "sin2": 0.75 + none, "log_cos_axis": -0.2 + none}
-    samples = replace(
-        within.samples, **even, log_distance=np.log(20.0) + none, bounce=bounces[0], views=VIEWS
-    )
-    samples = recorded(replace(samples, log_exposure=gain[frame]), material, true, generator)
-    samples = replace(samples, bounce=bounces[1])
-    log_L0, n, q = true.log_light
-    start = Globals.of(Light(math.exp(log_L0), n, q), Response(0.5), f0=0.035, bounce=True)
-    exposure = torch.zeros(SIGHTINGS, dtype=torch.float64)
-    for _ in range(8):
-        lit = replace(within, samples=replace(samples, log_exposure=exposure[frame]))
-        found = lit.renewed(material, start, ("n", "q", "albedo scale"), NOISE, Varied(SIGHTINGS))
-        start, exposure = found.shared, exposure + torch.from_numpy(found.log_gain)
-    return start.gamma, (exposure - exposure.mean()).numpy(), (gain - gain.mean()).numpy()
-
-
-def test_beside_a_bounce_known_exactly_colours_tell_the_response_where_gains_swallow_all_that_is_grey(
-    monkeypatch,
-):
-    monkeypatch.setattr("endotwin.fit.within.BOUNCE_ERROR", 0.0)
-    gamma, found, gain = told_by_colours(BOUNCING)
-    assert gamma == pytest.approx(BOUNCING.gamma, rel=0.02)
-    np.testing.assert_allclose(found, gain, atol=0.02)
-
-
-def test_what_the_bounce_lacks_bends_a_usual_response_by_less_than_half_of_what_photos_say(monkeypatch):
-    usual = Globals.of(Light(120.0, 1.7, 2.2), Response(1 / 2.2), f0=0.035, bounce=True)
-    held = abs(told_by_colours(usual, lacking=0.1)[0] - usual.gamma)
-    monkeypatch.setattr("endotwin.fit.within.BOUNCE_ERROR", 0.0)
-    bent = abs(told_by_colours(usual, lacking=0.1)[0] - usual.gamma)
-    assert bent > 0.04 * usual.gamma
-    assert held < bent / 2
-
-
-def test_beside_a_bounce_highlights_follow_the_light():
-    """L0 is held, so that where the exponent was off, all that is white is too bright or too dark."""
+def test_f0_is_found_beside_a_bounce():
     generator = np.random.default_rng(5)
     within, material = photographed()
     count, none = len(within.samples), torch.zeros(len(within.samples))
     log = np.log(0.1) - 2 * within.samples.log_distance[:, None] + torch.zeros(count, 3)
     bounce = Bounce(log.float(), none, none, torch.ones(count, 3), torch.zeros(count, 3), none)
     samples = replace(within.samples, bounce=bounce, views=VIEWS)
-    samples = recorded(samples, material, BOUNCING, generator)
-    shared = Globals.of(Light(120.0, 2.5, 2.2), Response(0.42), f0=0.07, bounce=True)
+    within = replace(within, samples=recorded(samples, material, BOUNCING, generator))
+    shared = Globals.of(Light(120.0, 1.7, 2.2), Response(0.42), f0=0.07, bounce=True)
     for _ in range(8):
-        found = replace(within, samples=samples).renewed(material, shared, ("q", "albedo scale"), NOISE)
-        shared = found.shared
+        shared = within.shone(material, shared, NOISE).shared
     assert told(shared) == pytest.approx(told(BOUNCING), rel=0.02)

@@ -62,15 +62,17 @@ CG_TOLERANCE = 1e-3
 CG_STEPS = 25
 SEARCH_SAMPLES = 300_000
 
-BOUNCE_ERROR = 1 / 255
-"""Of display values where light bounces, root mean square and alike in many pixels: much of it comes from
-tissue that nobody saw, and what a step does to it is known to first order. A step of light, response or the
-albedo's scale by one standard deviation of their prior must explain as much."""
-
 STANDARD_SPREAD = 0.05
 """Standard deviation among cameras of γ about that of displays: the curves of sRGB, BT.709 and BT.1886 are
 nearly powers of 0.45, 0.51 and 0.42. Where light bounces few levels tell γ from it, and what the model lacks
-bends γ instead: one that far off must explain BOUNCE_ERROR, too."""
+bends γ instead: one that far off must explain what a model ``errs_by``, too."""
+
+FIRST_ERROR = 1 / 255
+"""Of display values, root mean square and alike in many pixels: what a model errs by before it is fitted."""
+
+BLOCKS, OUTLYING, PASSING = 16, 3.0, 0.1
+"""Blocks across a photo, in each of which a model errs alike; residuals so many standard deviations off are
+highlights', and count as that much; the share of the error, of its square, that passes for another γ."""
 
 MOST_BRIGHTER = 0.5
 """Of the logarithm of bounced light, by a step of the albedo's scale: it grows faster than that."""
@@ -107,6 +109,9 @@ class GaussNewton:
     lies on the CPU.
 
     Attributes:
+        held: which shared parameters stay in joint steps.
+        errs_by: the model, where light bounces, in a way that passes for another γ: display values, root mean
+            square, alike in many pixels.
         solve_s: seconds of the last step, of what does not take longer with more samples.
     """
 
@@ -129,6 +134,7 @@ class GaussNewton:
         self.precision = prior_precision(operator, unit_mm).to(device)
         self._unit_mm = unit_mm
         self.held: tuple[str, ...] = ()
+        self.errs_by = FIRST_ERROR
         self.solve_s = 0.0
         self.out_of_time = out_of_time
         chosen = drawn(len(samples), SEARCH_SAMPLES, np.random.default_rng(seed))
@@ -181,12 +187,32 @@ class GaussNewton:
         """Mean and inverse variance of the shared parameters beside pixels that count ``scale`` each, [G]."""
         mean, spread = self._global_prior(state)
         precision = 1 / spread**2
-        precision[GAMMA] += self._errors(state, scale) / STANDARD_SPREAD**2
+        if state.shared.bounces:
+            precision[GAMMA] += len(self.samples) * scale * (self.errs_by / STANDARD_SPREAD) ** 2
         return mean, precision
 
-    def _errors(self, state: State, scale: float) -> float:
-        """What BOUNCE_ERROR counts in all pixels, of ``scale`` each; 0 where no light bounces."""
-        return len(self.samples) * scale * BOUNCE_ERROR**2 if state.shared.bounces else 0.0
+    def learn_error(self, state: State) -> None:
+        """Take what the model errs by, if that is less than was known, from a ``state`` nearer the photos.
+
+        It is off alike in BLOCKS of a photo: of two halves of a block the noise differs, and what their means
+        share is the model's.
+        """
+        trial, views = self._trial, self.samples.views
+        left = (trial.color.float() / 255 - self._predict(self._here(state))).mean(dim=1).cpu().numpy()
+        width = OUTLYING * self.noise(state)
+        left = left.clip(-width, width)
+        row, column = np.divmod(trial.pixel.cpu().numpy(), views.camera.width)
+        edge = math.ceil(views.camera.width / BLOCKS)
+        places = np.stack([views.row(trial.frame.cpu()), row // edge, column // edge])
+        _, block = np.unique(places, axis=1, return_inverse=True)
+        halves = [slice(start, None, 2) for start in (0, 1)]
+        count = np.stack([np.bincount(block[half], minlength=block.max() + 1) for half in halves])
+        total = np.stack([np.bincount(block[half], left[half], block.max() + 1) for half in halves])
+        whole = count.all(axis=0)
+        if not whole.any():
+            return
+        alike = float(np.mean(np.prod(total[:, whole] / count[:, whole], axis=0)))
+        self.errs_by = min(self.errs_by, math.sqrt(PASSING * max(0.0, alike)))
 
     def step(self, state: State, joint: bool = True, gains: bool = False) -> Step:
         """One Gauss–Newton step with a backtracking line search.
@@ -289,10 +315,8 @@ class GaussNewton:
         if not joint:
             return solved[..., 0], torch.zeros_like(state.shared.vector)
         mean, precision = self._prior(state, scale)
-        damping = self._errors(state, scale) / self._global_prior(state)[1] ** 2
-        damping[F0] = 0
         pull = (precision * (mean - state.shared.vector)).numpy()
-        shared_normal = equations.shared * scale + np.diag(precision + damping)
+        shared_normal = equations.shared * scale + np.diag(precision)
         shared_right = free.T @ (equations.shared_right * scale + pull)
         weights, along = _joint_minimum(
             solved, product(solved), right, free.T @ shared_normal @ free, shared_right

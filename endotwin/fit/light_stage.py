@@ -1,7 +1,7 @@
 """The light's stage: light, response and f0 beside coarse materials.
 
 In turns with the materials, light is found by what varies within vertices (``within``). Where it bounces, it
-depends on the materials, so that both are found in one step; what varies has the last word there, too.
+depends on the materials, so that both are found in one step.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ CELL_MM, COARSEST_MM = 1.6, 12.0
 PROXIES = 4
 """Vertices are merged to so many points a finest cell."""
 
-STEPS, BOUNCE_STEPS = 6, 10
+STEPS, BOUNCE_STEPS = 6, 12
 """Steps at most, and those where light bounces."""
 
 PALE = 0.75
@@ -67,9 +67,8 @@ BOUNCE_HELD = ("q", "L0")
 off a mesh errs by would bend it, and γ with it. L0 is told by the albedo's scale."""
 
 WORSE, HALVINGS = 1.25, 2
-"""A step under whose light the photos cost so many times what they did is too long, and halved so often; by
-what varies no light is taken under which they cost so many times what they do under that of joint steps, and
-no coat beside which they cost so many times what they do without."""
+"""A step under whose light the photos cost so many times what they did is too long, and halved so often; and
+no new coat is taken beside which they cost so many times what they do without."""
 
 SETTLING = 4
 """Steps at most of the materials under a light that was found beside a bounce."""
@@ -77,12 +76,9 @@ SETTLING = 4
 LEAVING = 2
 """Steps in which light learns to do without what is faint, before the materials do."""
 
-MISSES = 2
-"""After so many steps by what varies that lead to nothing better, there is none more."""
-
 CONVERGED, STEADY = 2e-4, 2e-3
-"""A step that changes the cost by a smaller share than this is the last; and so is one by what varies that
-changes γ, n and q by smaller ones: a tenth of what photos tell of them."""
+"""A step that changes the cost by a smaller share than this is the last; and so is one of light that bounces
+that changes γ, n, q and the coat by smaller ones: a tenth of what photos tell of them."""
 
 
 @dataclass(frozen=True)
@@ -220,13 +216,14 @@ class LightStage:
             if late:
                 break
             self._state, gain = self._stepped(self._state, joint=False)
-            number = self._next(number, STEPS, gain, COAT_STEP)
+            number = self._next(number, STEPS, COAT_STEP, self._converged(gain))
         self._without_faint(self._undetermined)
         return None
 
     def _in_one_step(self) -> Toned | None:
-        """Light and materials in one step, for the strength of the bounce; then light by what varies. Ends
-        early where photos show no bounce."""
+        """Light and materials in one step, for the strength of the bounce. Ends early where photos show no
+        bounce. Coat and tone are judged beside a response that is held near that of displays, for which they
+        could pass; then photos are believed as far as the model explains them."""
         number, best = BOUNCE_COAT_STEP if self._near else 0, None
         while number < BOUNCE_STEPS and not self._late:
             if (toned := self._newly_toned(number, BOUNCE_COAT_STEP)) is not None:
@@ -236,40 +233,22 @@ class LightStage:
             self._solver.held = (*self._undetermined, *BOUNCE_HELD, *scale)
             if shared.coat:
                 self._shine(shared)
+            if number >= BOUNCE_COAT_STEP:
+                self._solver.learn_error(self._state)
             self._state, gain = self._stepped(self._state, joint=True)
             if too_dark(self._state):
                 self._state = self._relighting.without_bounce(self._solver, self._state)
                 return None
             if number >= BOUNCE_COAT_STEP:
                 best = self._better(best)
-            number = self._next(number, BOUNCE_STEPS, gain, BOUNCE_COAT_STEP)
+            done = self._converged(gain) or _steady(shared, self._state.shared)
+            number = self._next(number, BOUNCE_STEPS, BOUNCE_COAT_STEP, done)
         if best is not None:
             if not self._late:
                 self._settle()
                 best = self._better(best)
-            self._take_best(self._by_what_varies(best))
-        self._without_faint((*self._undetermined, *BOUNCE_HELD, "albedo scale", "gamma"))
+            self._take_best(best)
         return None
-
-    def _by_what_varies(self, joint: Best) -> Best:
-        """Light and response by what varies within vertices, beside a bounce of the strength that was found
-        in ``joint`` steps, unless all pixels say that this is plainly worse: coarse albedo bends γ, and what
-        a video processor does to colours bends what varies. A step may lead over worse ones to better."""
-        held = (*self._undetermined, *BOUNCE_HELD, "albedo scale")
-        self._take_best(joint)
-        joint, missed = self._better(None), 0
-        best = replace(joint, cost=math.inf)
-        for _ in range(STEPS):
-            if self._pace.light_is_over() or missed == MISSES:
-                break
-            stood = self._state.shared
-            self._renew(stood, held, joint.noise)
-            self._settle()
-            before, best = best, self._better(best)
-            missed = missed + 1 if best is before else 0
-            if 0 < before.cost - best.cost < CONVERGED * before.cost or _steady(stood, self._state.shared):
-                break
-        return joint if best.cost > WORSE * joint.cost else best
 
     def _settle(self) -> None:
         """Materials beside a bounce, until they and what they throw on each other agree."""
@@ -296,11 +275,7 @@ class LightStage:
             if self._pace.light_is_over():
                 return
             self._renew(self._state.shared, held, self._noise)
-        if self._late:
-            return
-        if relighting.bounces:
-            self._settle()
-        else:
+        if not self._late:
             self._state, _ = self._stepped(self._state, joint=False)
 
     def _renew(self, shared: Globals, held: tuple[str, ...], noise: float) -> None:
@@ -340,11 +315,10 @@ class LightStage:
         self._relighting.expose(self._solver, best.effects, best.faint)
         self._relighting(self._solver, self._state)
 
-    def _next(self, number: int, steps: int, gain: float, coat_step: int) -> int:
-        """The number of the step that follows: where this one changed the cost by hardly anything (``gain``),
-        that of the coat, or none."""
+    def _next(self, number: int, steps: int, coat_step: int, done: bool) -> int:
+        """The number of the step that follows this one; when all is ``done``, that of the coat, or none."""
         self._pace.report("find the light", number + 1, steps)
-        if not self._converged(gain):
+        if not done:
             return number + 1
         return steps if len(self._decisions) == len(self._wanted) else max(number + 1, coat_step)
 
@@ -441,9 +415,12 @@ class LightStage:
 
 
 def _steady(before: Globals, after: Globals) -> bool:
-    """Whether light and response are hardly other than they were."""
-    pairs = zip((before.gamma, *before.log_light[1:]), (after.gamma, *after.log_light[1:]), strict=True)
-    return all(abs(now - was) < STEADY * max(was, STEADY) for was, now in pairs)
+    """Whether light, response and the coat are hardly other than they were."""
+    was, now = (
+        np.array([each.gamma, *each.log_light[1:], each.coat.weight if each.coat else 0.0])
+        for each in (before, after)
+    )
+    return bool((abs(now - was) < STEADY * np.maximum(was, STEADY)).all())
 
 
 def _started(

@@ -110,9 +110,9 @@ class Relighting:
     @property
     def varied(self) -> Varied:
         """What the light's steps may change beside light and response. Guides that cast shadows stay: by
-        these the probe has found them better than shading can. So do those whose light bounces."""
+        these the probe has found them better than shading can."""
         frames = len(self.effects["gain"].frames) if "gain" in self.effects else 0
-        if self.effects.guides_mm is None or "shadows" in self.effects or self.bounces:
+        if self.effects.guides_mm is None or "shadows" in self.effects:
             return Varied(frames, faint=self.faint)
 
         def aside(samples: Samples, step_mm: float) -> Iterator[Samples]:

@@ -4,9 +4,6 @@ Each vertex has an albedo that nobody knows. In log C that is an intercept of it
 vertex's mean takes it out exactly: what is left varies with distance, angle and frame only. Unlike a fit
 beside smooth albedo features, no texture can pass for shading, whatever those features cannot follow.
 
-Where light bounces, the ratios of a vertex's channels vary, too: tissue throws red light on tissue, and by
-how much of it a place has the response is told from the light. Each ratio has an intercept of its own.
-
 The gain of a frame is an intercept, too. A camera that comes nearer turns its gain down, so that gains pass
 for most of the fall-off: found in turns with it, they would stay where they were first guessed. So would
 guides, whose places pass for the light's exponents.
@@ -29,11 +26,8 @@ from endotwin.evidence.coat import LEAST_SIGHTINGS, Highlights
 from endotwin.evidence.tone import Hues
 from endotwin.fit.faint import NOTHING, Faint
 from endotwin.fit.gauss_newton import (
-    BOUNCE_ERROR,
     F0,
-    GAMMA,
     ROUGHNESS_LOGIT_SPREAD,
-    STANDARD_SPREAD,
     TEMPER,
     free_directions,
     global_prior,
@@ -137,11 +131,6 @@ class Sightings:
     by_varied: np.ndarray
     weight: np.ndarray
 
-    def beside(self, other: Sightings) -> Sightings:
-        """These, and then those of ``other``."""
-        pairs = zip(vars(self).items(), vars(other).values(), strict=True)
-        return Sightings(**{name: np.concatenate([mine, theirs]) for (name, mine), theirs in pairs})
-
 
 @dataclass(frozen=True)
 class Within:
@@ -174,8 +163,7 @@ class Within:
                 values.
         """
         diffuse = self.samples.sin2 > DIFFUSE_SIN2
-        level = "L0" if shared.bounces else "level"
-        found = self._step(material, shared, (*held, level, "f0"), diffuse, noise, varied)
+        found = self._step(material, shared, (*held, "level", "f0"), diffuse, noise, varied)
         if not shared.specular:
             return found
         shone = self.shone(material, found.shared, noise)
@@ -257,9 +245,6 @@ class Within:
         if not free.shape[1] or len(seen.residual) < LEAST_SIGHTINGS:
             return Renewed(shared, np.zeros(varied.frames), np.zeros((varied.guides, 3)))
         diffuse = "f0" in held
-        places, extra = self.count, seen.by_varied.shape[1]
-        if diffuse and shared.bounces:
-            seen, places = seen.beside(self._ratios(material, shared, chosen, noise, extra)), 3 * places
         frame = np.searchsorted(self.samples.views.frames, seen.frame) if varied.frames else None
         coated = not diffuse and shared.coat is not None
         columns, prior = self._columns(seen, shared, free, varied, diffuse, coated)
@@ -267,7 +252,7 @@ class Within:
         ends = np.cumsum([free.shape[1], 3 * varied.guides, len(faint)])
         ridge[slice(*ends[1:])] = FAINT_RIDGE
         target = seen.residual + columns[:, slice(*ends[1:])] @ faint
-        design = Design(columns, seen.vertex, places, frame, seen.weight, prior, ridge)
+        design = Design(columns, seen.vertex, self.count, frame, seen.weight, prior, ridge)
         found = regress(target, design, varied.frames, rounds=REWEIGHTS)
         along, aside_mm, fainter, shine = np.split(found.coefficients, ends)
         along, (rougher, wetter) = free @ along, shine if coated else (0.0, 0.0)
@@ -286,14 +271,11 @@ class Within:
     ) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]:
         """Columns of the ``free`` directions, of what is ``varied``, first of guides' places, of roughness
         where light is ``diffuse`` or a coat is sought, and then of its weight; and what is known of their
-        coefficients: of γ by BOUNCE_ERROR in brightness, which ratios have less of."""
+        coefficients."""
         mean, spread = (x.numpy() for x in global_prior(self.unit_mm, len(shared.vector)))
         known = np.zeros(seen.by_varied.shape[1])
         known[: 3 * varied.guides] = TEMPER / (ASIDE_SPREAD * self.distance_mm) ** 2
         sure = TEMPER / spread**2
-        if shared.bounces:
-            told = float(seen.weight[seen.vertex < self.count].sum())
-            sure[GAMMA] += told * (BOUNCE_ERROR / self._shown / STANDARD_SPREAD) ** 2
         parts = [free.T @ np.diag(sure) @ free, np.diag(known)]
         pulls = [free.T @ (sure * (mean - shared.vector.numpy())), 0 * known]
         columns = [seen.slopes @ free, seen.by_varied]
@@ -306,11 +288,6 @@ class Within:
             parts.append([[TEMPER / COAT_SPREAD**2]])
             pulls.append([-TEMPER * shared.coat.weight / COAT_SPREAD**2])
         return np.hstack(columns), (scipy.linalg.block_diag(*parts), np.concatenate(pulls))
-
-    @property
-    def _shown(self) -> float:
-        """Mean display value."""
-        return float(self.samples.color.float().mean()) / 255
 
     @property
     def distance_mm(self) -> float:
@@ -357,32 +334,6 @@ class Within:
         by_roughness = (model.by_roughness[bright] * by_raw * tells).mean(dim=1).numpy() / predicted
         columns = (residual, by_roughness, by_coat, *slopes.T, *by_guides, *by_faint)
         return self._gathered(rows, columns, (noise / predicted) ** 2, MODEL_ERROR, slopes.shape[1])
-
-    def _ratios(
-        self, material: Tensor, shared: Globals, chosen: Tensor, noise: float, varied: int
-    ) -> Sightings:
-        """Sightings of the RATIOS of channels of the ``chosen`` samples in which none is dark or clipped, as
-        vertices of their own; no gain changes them, nor what else is ``varied``: they are of the first
-        frame."""
-        rows, shown = self._coloured(chosen), self.samples.color
-        model = linearise(self.samples[rows], material[rows], shared)
-        bright = (model.predicted > DARKEST).all(dim=1)
-        rows, predicted = rows[bright], model.predicted[bright].double()
-        residual = torch.log(shown[rows].double() / 255) - torch.log(predicted)
-        slopes = model.by_globals[bright].double() / predicted[..., None]
-        by_raw = roughness_slope(material[rows, 3])[:, None]
-        by_roughness = model.by_roughness[bright] * by_raw / predicted
-        found = []
-        for number, ratio in enumerate(RATIOS, start=1):
-            by_shared = (ratio @ slopes).T.numpy()
-            columns = ((residual @ ratio).numpy(), (by_roughness @ ratio).numpy(), np.zeros(len(rows)))
-            variance = ((noise / predicted) ** 2 @ ratio**2).numpy()
-            each = self._gathered(rows, (*columns, *by_shared), variance, RATIO_ERROR, len(by_shared))
-            first = np.full_like(each.frame, self.samples.views.frames[0])
-            same = np.zeros((len(first), varied))
-            vertex = each.vertex + number * self.count
-            found.append(replace(each, vertex=vertex, frame=first, by_varied=same))
-        return found[0].beside(found[1])
 
     def _gathered(
         self, rows: Tensor, columns: tuple[np.ndarray, ...], variance: np.ndarray, error: float, count: int
