@@ -51,7 +51,7 @@ def test_a_response_that_no_display_has_is_found_where_light_bounces(tmp_path: P
 
 @pytest.mark.slow
 def test_a_haze_brighter_than_water_does_not_ruin_a_bounce(tmp_path: Path, monkeypatch) -> None:
-    """Whatever the highlights say: all pixels of such tissue give it hardly any weight, or are worse with it."""
+    """Whatever the highlights say: all pixels of such tissue give it hardly any weight, or are worse."""
     said = Decision("on", "the highlights say so", 1.1)
     haze = Coat(weight=7.0, roughness=0.32, tail=1.0)
     monkeypatch.setattr(light_stage, "judged_coat", lambda highlights, wanted: (haze, said))
