@@ -70,7 +70,7 @@ bends γ instead: one that far off must explain what a model ``errs_by``, too.""
 FIRST_ERROR = 1 / 255
 """Of display values, root mean square and alike in many pixels: what a model errs by before it is fitted."""
 
-BLOCKS, OUTLYING, PASSING = 16, 3.0, 0.1
+BLOCKS, OUTLYING, PASSING = 16, 3.0, 0.3
 """Blocks across a photo, in each of which a model errs alike; residuals so many standard deviations off are
 highlights', and count as that much; the share of the error, of its square, that passes for another γ."""
 
