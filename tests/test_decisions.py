@@ -44,9 +44,9 @@ def test_the_strength_of_a_bounce_off_pale_tissue_is_found(tmp_path: Path) -> No
 @pytest.mark.slow
 def test_a_response_that_no_display_has_is_found_where_light_bounces(tmp_path: Path) -> None:
     """What the model errs by says how far photos are believed, and it is little here."""
-    twin, made = fitted(tmp_path, 144, {"interreflection"})
-    assert made["gamma"] > 0.53
-    assert twin.response.gamma == pytest.approx(made["gamma"], rel=0.05)
+    twin, made = fitted(tmp_path, 177, {"interreflection"})
+    assert made["gamma"] > 0.51
+    assert twin.response.gamma == pytest.approx(made["gamma"], rel=0.04)
 
 
 @pytest.mark.slow
