@@ -201,13 +201,13 @@ class GaussNewton:
         left = (trial.color.float() / 255 - self._predict(self._here(state))).mean(dim=1).cpu().numpy()
         width = OUTLYING * self.noise(state)
         left = left.clip(-width, width)
-        row, column = np.divmod(trial.pixel.cpu().numpy(), views.camera.width)
-        edge = math.ceil(views.camera.width / BLOCKS)
-        places = np.stack([views.row(trial.frame.cpu()), row // edge, column // edge])
-        _, block = np.unique(places, axis=1, return_inverse=True)
-        halves = [slice(start, None, 2) for start in (0, 1)]
-        count = np.stack([np.bincount(block[half], minlength=block.max() + 1) for half in halves])
-        total = np.stack([np.bincount(block[half], left[half], block.max() + 1) for half in halves])
+        camera, edge = views.camera, math.ceil(views.camera.width / BLOCKS)
+        row, column = np.divmod(trial.pixel.cpu().numpy(), camera.width)
+        shape = (len(views.frames), camera.height // edge + 1, camera.width // edge + 1)
+        block = np.ravel_multi_index((views.row(trial.frame.cpu()), row // edge, column // edge), shape)
+        halves, blocks = [slice(start, None, 2) for start in (0, 1)], math.prod(shape)
+        count = np.stack([np.bincount(block[half], minlength=blocks) for half in halves])
+        total = np.stack([np.bincount(block[half], left[half], blocks) for half in halves])
         whole = count.all(axis=0)
         if not whole.any():
             return

@@ -18,7 +18,6 @@ from endotwin.effects.tone import Tone
 from endotwin.evidence.coat import judged as judged_coat
 from endotwin.evidence.tone import Hues, steadied
 from endotwin.evidence.tone import judged as judged_tone
-from endotwin.fit.faint import Faint
 from endotwin.fit.gauss_newton import GaussNewton
 from endotwin.fit.hashgrid import HashGrid, HashOperator
 from endotwin.fit.lighting import Relighting
@@ -128,12 +127,11 @@ class FoundLight:
 
 @dataclass(frozen=True)
 class Best:
-    """A ``state``, with the ``effects`` and what is ``faint`` that were found with it, that costs least under
-    its own light, by the ``noise`` at which others are held to it."""
+    """A ``state``, with the ``effects`` that were found with it, that costs least under its own light, by the
+    ``noise`` at which others are held to it."""
 
     state: State
     effects: Effects
-    faint: Faint
     cost: float
     noise: float
 
@@ -217,7 +215,7 @@ class LightStage:
                 break
             self._state, gain = self._stepped(self._state, joint=False)
             number = self._next(number, STEPS, COAT_STEP, self._converged(gain))
-        self._without_faint(self._undetermined)
+        self._without_faint()
         return None
 
     def _in_one_step(self) -> Toned | None:
@@ -262,10 +260,10 @@ class LightStage:
         """Whether a step by which the cost fell by ``gain`` changed hardly anything."""
         return abs(gain) < CONVERGED * self._solver.cost(self._state, self._noise)
 
-    def _without_faint(self, held: tuple[str, ...]) -> None:
-        """The light that predicts best without what is too faint to be an effect, if there is any; what is
-        ``held`` stays as it was found beside it, and so does γ, if the photos show it."""
-        solver, relighting = self._solver, self._relighting
+    def _without_faint(self) -> None:
+        """The light that predicts best without what is too faint to be an effect, if there is any; γ stays as
+        it was found beside it, if the photos show it."""
+        solver, relighting, held = self._solver, self._relighting, self._undetermined
         if not relighting.faint.found:
             return
         if relighting.faint.shows(solver.samples, self._state.shared.gamma):
@@ -312,7 +310,7 @@ class LightStage:
 
     def _take_best(self, best: Best) -> None:
         self._state = best.state
-        self._relighting.expose(self._solver, best.effects, best.faint)
+        self._relighting.expose(self._solver, best.effects)
         self._relighting(self._solver, self._state)
 
     def _next(self, number: int, steps: int, coat_step: int, done: bool) -> int:
@@ -378,7 +376,7 @@ class LightStage:
         cost = self._solver.cost(self._state, noise)
         if best is not None and best.cost <= cost:
             return best
-        return Best(self._state, self._relighting.effects, self._relighting.faint, cost, noise)
+        return Best(self._state, self._relighting.effects, cost, noise)
 
     def _stepped(self, state: State, joint: bool, mixing: Mixing | None = None) -> tuple[State, float]:
         """A step, of the materials alone where a ``joint`` one finds nothing lower, with the samples relit by

@@ -144,10 +144,10 @@ class Relighting:
             self.effects = _brightened(self.effects, log_gain)
             solver.relight(self._exposed(solver.samples))
 
-    def expose(self, solver: GaussNewton, effects: Effects, faint: Faint = NOTHING) -> None:
-        """The samples of ``solver`` with the gain and vignetting of ``effects`` and what is ``faint``, which
-        hold from here on."""
-        self.effects, self.faint = effects, faint
+    def expose(self, solver: GaussNewton, effects: Effects) -> None:
+        """The samples of ``solver`` with the gain and vignetting of ``effects``, which hold from here on, and
+        nothing faint."""
+        self.effects, self.faint = effects, NOTHING
         solver.relight(self._exposed(solver.samples))
 
     def _exposed(self, samples: Samples) -> Samples:

@@ -333,16 +333,9 @@ class Within:
         by_raw = roughness_slope(material[rows, 3])[:, None]
         by_roughness = (model.by_roughness[bright] * by_raw * tells).mean(dim=1).numpy() / predicted
         columns = (residual, by_roughness, by_coat, *slopes.T, *by_guides, *by_faint)
-        return self._gathered(rows, columns, (noise / predicted) ** 2, MODEL_ERROR, slopes.shape[1])
-
-    def _gathered(
-        self, rows: Tensor, columns: tuple[np.ndarray, ...], variance: np.ndarray, error: float, count: int
-    ) -> Sightings:
-        """Sightings of samples ``rows``: means of residual, slopes by roughness and coat, by ``count`` shared
-        parameters and by what is varied, each [R]."""
-        vertex, frame, *means, weight = self._means(rows, columns, variance, error)
-        slopes, by_varied = np.split(np.stack(means[3:], axis=1), [count], axis=1)
-        return Sightings(vertex, frame, means[0], slopes, *means[1:3], by_varied, weight)
+        vertex, frame, *means, weight = self._means(rows, columns, (noise / predicted) ** 2, MODEL_ERROR)
+        by_shared, by_varied = np.split(np.stack(means[3:], axis=1), [slopes.shape[1]], axis=1)
+        return Sightings(vertex, frame, means[0], by_shared, *means[1:3], by_varied, weight)
 
     def _means(
         self, rows: Tensor, columns: tuple[np.ndarray, ...], variance: np.ndarray, error: float
