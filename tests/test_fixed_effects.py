@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.optimize import lsq_linear
 
 from endotwin.pixels.fixed_effects import DENSE, Design, FixedEffects, regress, robust_losses, without_means
 
@@ -42,6 +43,19 @@ def test_a_ridge_is_a_value_of_0_for_a_share_of_what_the_values_tell_of_a_coeffi
     found = regress(target, design, rounds=1).coefficients
     np.testing.assert_allclose(found, np.linalg.lstsq(rows, np.r_[target * root, 0])[0], atol=1e-6)
     assert abs(found[1]) < 0.7 * 2
+
+
+def test_coefficients_that_are_not_below_0_are_those_of_bounded_least_squares():
+    target, design = made(200, 10, 4)
+    dummies = np.eye(10)[design.group], np.eye(4)[design.category][:, 1:]
+    root = np.sqrt(design.weight)
+    full, low = np.hstack([design.columns, *dummies]) * root[:, None], np.full(16, -np.inf)
+    low[:2] = 0
+    solved = lsq_linear(full, target * root, (low, np.inf)).x
+    assert solved[1] == pytest.approx(0, abs=1e-6)
+    found = regress(target, replace(design, positive=2), 4, rounds=1)
+    np.testing.assert_allclose(found.coefficients, solved[:3], atol=1e-5)
+    np.testing.assert_allclose(found.intercepts, np.r_[0, solved[13:]], atol=5e-5)
 
 
 def test_outliers_bend_a_robust_regression_by_less_than_their_share():

@@ -147,16 +147,15 @@ class _Trial:
         """
         best, _ = self._pruned(best, ("gain",))
         base = replace(self._model(best).hypothesis, vignetting=self.wanted("vignetting") != "off")
-        found_mm = self._found_guides(base, self.wanted("offset") == "on")
         bounces = base.bounced is not None
-        self._guides_mm = dict.fromkeys((False, True), found_mm)
-        if found_mm == AT_LENS or self.wanted("interreflection") == "off" or self._late():
-            return
-        if self.wanted("interreflection") == "auto":
+        found_mm = other_mm = self._found_guides(base, self.wanted("offset") == "on")
+        hidden = not (bounces and found_mm == AT_LENS)
+        if self.wanted("interreflection") == "auto" and hidden and not self._late():
             other = replace(base, bounced=None if bounces else self._bouncing(AT_LENS))
             other_mm = self._found_guides(other, False)
-            if other_mm != AT_LENS:
-                self._guides_mm[not bounces] = other_mm
+        self._guides_mm = {bounces: _first(found_mm, other_mm), not bounces: _first(other_mm, found_mm)}
+        if not self._beside_lens or self.wanted("interreflection") == "off" or self._late():
+            return
         own = Hypothesis(self._guides_mm[True], shadows=True, gain=base.gain)
         own = replace(own, bounced=self._bouncing(own.guides_mm))
         self._guides_mm[True] = Search.of(self._probe, own, self._glints()).polished()
@@ -362,6 +361,11 @@ class _Trial:
         if hypothesis.vignetting:
             effects.append(Vignetting(k2=kept.vignetting))
         return Effects(effects)
+
+
+def _first(*guides_mm: Guides) -> Guides:
+    """The first that is not at the lens, if any."""
+    return next((each for each in guides_mm if each != AT_LENS), AT_LENS)
 
 
 def _worth(name: str, verdict: Verdict) -> bool:

@@ -3,56 +3,45 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import cache, lru_cache
+from functools import cache, cached_property, lru_cache
 
 import numpy as np
 from scipy.optimize import least_squares, minimize
 
 from endotwin.evidence.glints import Glints
+from endotwin.evidence.light_map import LightMap, places_mm
 from endotwin.evidence.probe import Fitted, Hypothesis, Probe
 from endotwin.light.guides import AT_LENS
 
 Guides = tuple[tuple[float, float, float], ...]
 """Positions in the camera frame, mm."""
 
-RING = 0.12
+RADIUS = 0.12
 """By what guides' places are measured, as a share of the median viewing distance: 2.4 mm at a tip that sees
 the wall from 20 mm."""
 
-RING_RADII = (0.5, 1.0, 2.5)
-"""Of it, the rings about the lens on which guides are first sought: the outermost is the rim of such a tip.
-From those within the search does not get out to guides that stand there."""
-
-RING_POINTS = 8
 MOST_GUIDES = 3
 SEARCH_PIXELS = 8_000
 """Guides are sought with so many pixels of the probe; those that are kept are polished with all."""
 
 STEPS, POLISH_STEPS = 12, 30
 TOLERANCE = 1e-3
-"""The search ends when positions move by less than this share of the ring's radius, or the loss by less."""
+"""The search ends when positions move by less than this share of the radius, or the loss by less."""
 
 SEEN_GUIDES = 64
 """What so many guides see is kept: of several one is moved at a time."""
 
 DEEPEST = 1.0
-"""Of the ring's radius: guides lie at most so far behind the lens."""
+"""Of the radius: guides lie at most so far behind the lens."""
 
 ASIDE, POLISH_ASIDE = 0.1, 0.05
-"""Of the ring's radius: by so much guides are moved to find what their positions change. With less, the
+"""Of the radius: by so much guides are moved to find what their positions change. With less, the
 shadows that jump from pixel to pixel hide it."""
 
 
 def radius_mm(probe: Probe) -> float:
-    """RING of the median viewing distance."""
-    return RING * float(np.exp(np.median(probe.samples.log_distance.numpy())))
-
-
-def ring_mm(probe: Probe, share: float) -> np.ndarray:
-    """Positions about the lens at a ``share`` of the radius, float32 [RING_POINTS, 3]."""
-    angle = 2 * np.pi * np.arange(RING_POINTS) / RING_POINTS
-    around = np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)
-    return (share * radius_mm(probe) * around).astype(np.float32)
+    """RADIUS of the median viewing distance."""
+    return RADIUS * float(np.exp(np.median(probe.samples.log_distance.numpy())))
 
 
 def found_guides(
@@ -65,7 +54,7 @@ def found_guides(
     lens pass for one behind it: another is believed only beside those before it where they are best. With
     ``forced`` there is always a position: that of the most guides, if none is worth it.
     """
-    plain, best, guides_mm = probe.fit(base), None, ()
+    plain, best = probe.fit(base), None
     if near_mm != AT_LENS:
         near = replace(base, guides_mm=near_mm, shadows=True)
         near = replace(near, guides_mm=Search.of(probe, near, glints).settled())
@@ -75,8 +64,7 @@ def found_guides(
     if not forced and not search.hints():
         return AT_LENS
     for number in range(1, MOST_GUIDES + 1):
-        guides_mm = search.best(guides_mm)
-        found = probe.fit(replace(base, guides_mm=guides_mm, shadows=True))
+        found = probe.fit(replace(base, guides_mm=search.best(number), shadows=True))
         worth = probe.compare(best or plain, found).keep
         if worth and best is not None:
             worth = probe.compare(settled(probe, best, glints), found).keep
@@ -106,10 +94,10 @@ class Search:
 
     def __init__(self, probe: Probe, base: Hypothesis, glints: Glints):
         self._probe, self._base, self._glints = probe, probe.fit(base), glints
-        self._candidates = np.concatenate([ring_mm(probe, share) for share in RING_RADII])
-        seen = [probe.visible(guide) for guide in self._candidates]
-        self._at_risk = np.flatnonzero(~np.logical_and.reduce(seen))
         self._radius_mm = radius_mm(probe)
+        self._places_mm = places_mm(self._radius_mm)
+        self._lit = np.stack([probe.visible(place) for place in self._places_mm], axis=1)
+        self._at_risk = np.flatnonzero(~self._lit.all(axis=1))
         self.best = cache(self._best)
         self._seen = lru_cache(SEEN_GUIDES)(lambda guide: probe.visible(np.float32(guide), self._at_risk))
 
@@ -120,35 +108,24 @@ class Search:
         base = base if base.bounced is None else replace(base, bounced=base.bounced[rows])
         return cls(part, base, glints)
 
+    @cached_property
+    def _map(self) -> LightMap:
+        return LightMap.of(self._probe, self._base, self._places_mm, self._lit)
+
     def hints(self) -> bool:
-        """Whether one guide, wherever it is best, or two or three about the lens predict better."""
-        alone = np.array(self.best(()))
-        more = range(2, MOST_GUIDES + 1)
-        about = [min(self._about(number), key=self._loss) for number in more]
-        told = [self._glints.guides_mm(number) for number in more]
-        models = [self._probe.fit(self._with(each)) for each in (alone, *about, *told) if len(each)]
+        """Whether one guide, wherever it is best, or two or three where light gathers predict better."""
+        more = [start for number in range(2, MOST_GUIDES + 1) for start in self._starts(number)]
+        models = [self._probe.fit(self._with(each)) for each in (self.best(1), *more)]
         return any(self._probe.compare(self._base, model).hints for model in models)
 
-    def _best(self, fewer_mm: Guides) -> Guides:
-        """The best positions with one guide more than there are in ``fewer_mm``."""
-        known = np.array(fewer_mm, np.float32).reshape(-1, 3)
-        start_mm = min([*self._joined(known), *self._about(len(known) + 1)], key=self._loss)
-        for moved in range(len(known)):
-            others = np.delete(start_mm, moved, axis=0)
-            start_mm = min([start_mm, *self._joined(others)], key=self._loss)
-        starts_mm = [start_mm, self._glints.guides_mm(len(start_mm))]
-        return min((self._refined(each) for each in starts_mm if len(each)), key=self._loss)
+    def _best(self, number: int) -> Guides:
+        """The best positions of so many guides."""
+        return min((self._refined(start) for start in self._starts(number)), key=self._loss)
 
-    def _about(self, number: int) -> list[np.ndarray]:
-        """``number`` guides about the lens, on one ring, evenly apart as nearly as its points allow."""
-        rings = self._candidates.reshape(len(RING_RADII), RING_POINTS, 3)
-        step = np.round(np.arange(number) * RING_POINTS / number).astype(int)
-        turns = range(RING_POINTS // 2 if number == 2 else RING_POINTS)
-        return [ring[(step + turn) % RING_POINTS] for ring in rings for turn in turns]
-
-    def _joined(self, known_mm: np.ndarray) -> list[np.ndarray]:
-        """``known_mm`` [K, 3] with each of the candidates, [K + 1, 3] each."""
-        return [np.vstack([known_mm, candidate]) for candidate in self._candidates]
+    def _starts(self, number: int) -> list[np.ndarray]:
+        """Where so many guides are sought from: where light gathers, and where the glints say."""
+        told = self._glints.guides_mm(number)
+        return [*self._map.guides_mm(number), *([told] if len(told) else [])]
 
     def settled(self) -> Guides:
         """The base's own guides, moved to where they predict best beside its effects."""
@@ -186,7 +163,7 @@ class Search:
         return _plain(self._guides(found.x, axes))
 
     def _coordinates(self, guides_mm: Guides | np.ndarray, axes: int) -> np.ndarray:
-        """The first so many coordinates of K guides in ring's radii, [K · axes]."""
+        """The first so many coordinates of K guides in radii, [K · axes]."""
         return np.asarray(guides_mm, np.float64)[:, :axes].ravel() / self._radius_mm
 
     def _guides(self, x: np.ndarray, axes: int) -> np.ndarray:

@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.optimize import nnls
 from scipy.sparse import csr_array
 
 HUBER = 1.345
@@ -31,6 +32,7 @@ class Design:
         weight: [N], inverse variances up to one factor; None: all alike.
         prior: precision [C, C] and pull [C] of the coefficients, beside values of variance 1 / weight; None:
         nothing is known of them.
+        positive: so many of the first coefficients are not below 0.
         ridge: [C], that a coefficient is 0 is told by this share of what values tell of it alone; None: 0.
     """
 
@@ -41,11 +43,12 @@ class Design:
     weight: np.ndarray | None = None
     prior: tuple[np.ndarray, np.ndarray] | None = None
     ridge: np.ndarray | None = None
+    positive: int = 0
 
     def __getitem__(self, rows: np.ndarray) -> Design:
         category, weight = (None if x is None else x[rows] for x in (self.category, self.weight))
         columns, group = self.columns[rows], self.group[rows]
-        return Design(columns, group, self.count, category, weight, self.prior, self.ridge)
+        return Design(columns, group, self.count, category, weight, self.prior, self.ridge, self.positive)
 
     @property
     def trust(self) -> np.ndarray:
@@ -92,13 +95,24 @@ def regress(target: np.ndarray, design: Design, categories: int = 0, rounds: int
             precision, pull = design.prior
             normal[:slopes, :slopes] += width**2 * precision
             right[:slopes] += width**2 * pull
-        solved = np.linalg.solve(normal, right)
+        solved = _solved(normal, right, design.positive)
         found = FixedEffects(solved[:slopes], np.r_[0.0, solved[slopes:]], 0.0)
         left = (target - design.explained(found))[:, None]
         left = np.abs(without_means(left, weight, group, count)[:, 0]) * np.sqrt(trust)
         width = max(1.4826 * float(np.median(left)), 1e-6) if len(left) else 1e-6
         weight = trust * np.minimum(1, HUBER * width / np.maximum(left, 1e-12))
     return FixedEffects(found.coefficients, found.intercepts, width)
+
+
+def _solved(normal: np.ndarray, right: np.ndarray, positive: int) -> np.ndarray:
+    """Least squares of normal equations in which so many of the first unknowns are not below 0."""
+    if not positive:
+        return np.linalg.solve(normal, right)
+    first, rest = slice(positive), slice(positive, None)
+    others = np.linalg.solve(normal[rest, rest], np.c_[normal[rest, first], right[rest]])
+    root = np.linalg.cholesky(normal[first, first] - normal[first, rest] @ others[:, :-1])
+    found, _ = nnls(root.T, np.linalg.solve(root, right[first] - normal[first, rest] @ others[:, -1]))
+    return np.r_[found, others[:, -1] - others[:, :-1] @ found]
 
 
 def _normal_equations(

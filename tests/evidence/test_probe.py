@@ -11,6 +11,7 @@ from independent.light import burley, ggx
 
 from endotwin.config import STANDARD
 from endotwin.evidence.decide import LEAST
+from endotwin.evidence.light_map import LightMap, places_mm
 from endotwin.evidence.probe import Hypothesis, Probe
 from endotwin.evidence.sightings import Sightings
 from endotwin.pipeline import fuse_twin
@@ -60,6 +61,39 @@ def test_a_rough_lobe_bends_no_light_and_passes_for_no_other_effect(example, rou
     others = (Hypothesis(gain=True), Hypothesis(profile=1.0), BESIDE)
     assert not any(probe.compare(plain, probe.fit(each)).keep for each in others)
     assert not probe.compare(plain, probe.fit(Hypothesis(vignetting=True))).worth(LEAST["vignetting"])
+
+
+@pytest.mark.parametrize(
+    "guides_mm",
+    [[(0.0, 0, 0)], [(3.5, 1, 0)], [(3.0, 1, 0), (-2, -3, 0)], [(4.0, 0.5, 0), (-2, 3, 0), (-2, -3.5, 0)]],
+)
+def test_a_map_of_the_light_shows_from_where_it_comes_and_where_its_guides_stand(example, guides_mm):
+    guides_mm, rng = np.array(guides_mm), np.random.default_rng(5)
+    light = 0.0
+    for guide_mm in guides_mm:
+        towards = guide_mm - example.points_mm
+        distance = np.linalg.norm(towards, axis=1)
+        wi = towards / distance[:, None]
+        lit = example.visible(guide_mm) * np.maximum((wi * example.normals).sum(axis=1), 0)
+        light = light + lit * (-wi[:, 2]) ** 2.5 / distance**2
+    albedo = (0.5 * np.exp(rng.normal(0, 0.2, example.count)))[example.vertex]
+    rows = np.flatnonzero(light > 0)
+    probe = copy.copy(example)
+    probe.samples = example.samples[torch.from_numpy(rows)]
+    probe.vertex = np.unique(example.vertex[rows], return_inverse=True)[1]
+    probe.count = 1 + int(probe.vertex.max())
+    for name in ("frame", "points_mm", "normals", "local_points_mm", "local_normals", "vignetting_column"):
+        vars(probe)[name] = getattr(example, name)[rows]
+    probe.target = np.log((albedo * light)[rows]) / 2.2 + rng.normal(0, 0.01, len(rows))
+    radius_mm = 2.4
+    places = places_mm(radius_mm)
+    visible = np.stack([probe.visible(place) for place in places], axis=1)
+    found = LightMap.of(probe, probe.fit(Hypothesis()), places, visible)
+    apart_mm = np.linalg.norm(found.places_mm[:, None] - guides_mm, axis=2)
+    assert found.share[apart_mm.min(axis=1) < radius_mm].sum() > 0.8
+    for start_mm, within_mm in zip(found.guides_mm(len(guides_mm)), (1.2, 0.6), strict=True):
+        apart_mm = np.linalg.norm(start_mm[:, None] - guides_mm, axis=2)
+        assert apart_mm.min(axis=0).max() < within_mm
 
 
 def test_a_pixel_that_shows_light_is_not_taken_to_lie_in_full_shadow(example):
