@@ -6,7 +6,7 @@ from dataclasses import replace
 from functools import cache, cached_property, lru_cache
 
 import numpy as np
-from scipy.optimize import least_squares, minimize
+from scipy.optimize import least_squares
 
 from endotwin.evidence.glints import Glints
 from endotwin.evidence.light_map import LightMap, places_mm
@@ -24,8 +24,7 @@ MOST_GUIDES = 3
 SEARCH_PIXELS = 8_000
 """Guides are sought with so many pixels of the probe; those that are kept are polished with all."""
 
-STEPS, POLISH_STEPS = 12, 30
-TOLERANCE = 1e-3
+STEPS, TOLERANCE = 12, 1e-3
 """The search ends when positions move by less than this share of the radius, or the loss by less."""
 
 SEEN_GUIDES = 64
@@ -34,7 +33,7 @@ SEEN_GUIDES = 64
 DEEPEST = 1.0
 """Of the radius: guides lie at most so far behind the lens."""
 
-ASIDE, POLISH_ASIDE = 0.1, 0.05
+ASIDE = 0.1
 """Of the radius: by so much guides are moved to find what their positions change. With less, the
 shadows that jump from pixel to pixel hide it."""
 
@@ -132,20 +131,8 @@ class Search:
         return self._refined(self._base.hypothesis.guides_mm, axes=3)
 
     def polished(self) -> Guides:
-        """As ``settled``, for guides that were sought in the plane of the lens; at last without derivatives,
-        for shadows jump."""
-        within = self._refined(self._base.hypothesis.guides_mm)
-        first = self._coordinates(self._refined(within, axes=3), axes=3)
-        options = {
-            "maxfev": POLISH_STEPS * len(first) // 2,
-            "xatol": TOLERANCE,
-            "fatol": TOLERANCE * self._loss(self._guides(first, axes=3)),
-            "initial_simplex": np.vstack([first, first - POLISH_ASIDE * np.eye(len(first))]),
-        }
-        found = minimize(
-            lambda x: self._loss(self._guides(x, axes=3)), first, method="Nelder-Mead", options=options
-        )
-        return _plain(self._guides(found.x, axes=3))
+        """As ``settled``, for guides that were sought in the plane of the lens."""
+        return self._refined(self._refined(self._base.hypothesis.guides_mm), axes=3)
 
     def _refined(self, start_mm: Guides | np.ndarray, axes: int = 2) -> Guides:
         """Guides moved from ``start_mm`` [K, 3] by Gauss–Newton, in the plane of the lens, or along 3

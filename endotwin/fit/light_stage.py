@@ -67,7 +67,10 @@ off a mesh errs by would bend it, and γ with it. L0 is told by the albedo's sca
 
 WORSE, HALVINGS = 1.25, 2
 """A step under whose light the photos cost so many times what they did is too long, and halved so often; and
-no new coat is taken beside which they cost so many times what they do without."""
+no new coat is kept beside which they cost so many times what they did without."""
+
+COATED_STEPS = 2
+"""In which materials learn to do without what a new coat shows, before all pixels judge it."""
 
 SETTLING = 4
 """Steps at most of the materials under a light that was found beside a bounce."""
@@ -164,6 +167,7 @@ class LightStage:
     ):
         self._clipped, self._surface, self._pace, self._wanted = clipped, surface, pace, wanted
         self._relighting, self._undetermined = relighting, start.undetermined
+        self._bare: Best | None = None
         tone, decision = (None, None) if before is None else before.toned
         self._decisions: dict[str, Decision] = {} if tone is None else {"tone": decision}
         self._unit_mm = unit_mm(surface)
@@ -234,18 +238,23 @@ class LightStage:
             if number >= BOUNCE_COAT_STEP:
                 self._solver.learn_error(self._state)
             self._state, gain = self._stepped(self._state, joint=True)
-            if too_dark(self._state):
+            if too_dark(self._state) and self._bare is not None:
+                self._leave_coat("beside it no light would bounce")
+            elif too_dark(self._state):
                 self._state = self._relighting.without_bounce(self._solver, self._state)
                 return None
-            if number >= BOUNCE_COAT_STEP:
+            if number + 1 >= BOUNCE_COAT_STEP + COATED_STEPS:
+                self._leave_worse_coat()
+            if number >= BOUNCE_COAT_STEP and self._bare is None:
                 best = self._better(best)
             done = self._converged(gain) or _steady(shared, self._state.shared)
             number = self._next(number, BOUNCE_STEPS, BOUNCE_COAT_STEP, done)
-        if best is not None:
+        self._leave_worse_coat()
+        if number > BOUNCE_COAT_STEP:
+            best = self._better(best)
             if not self._late:
                 self._settle()
-                best = self._better(best)
-            self._take_best(best)
+            self._take_best(self._better(best))
         return None
 
     def _settle(self) -> None:
@@ -354,20 +363,27 @@ class LightStage:
         return replace(state.shared, coat=layer)
 
     def _shine(self, shared: Globals) -> None:
-        """Take ``shared`` with the f0, coat and roughness that all pixels ask for; or leave off a coat that
-        is new, and that they give no weight or are plainly worse beside: highlights alone have found it."""
+        """Take ``shared`` with the f0, coat and roughness that all pixels ask for; a coat that is new, which
+        highlights alone have found, for a trial, unless they give it no weight."""
         before, noise = self._state, self._noise
         within, material = self._within()
         self._take(within.shone(material, shared, noise))
         if before.shared.coat is not None or self._wanted["coat"] == "on":
             return
+        self._bare = Best(before, self._relighting.effects, self._solver.cost(before, noise), noise)
         if self._state.shared.coat.weight == 0:
-            flaw = "all pixels give it no weight"
-        elif self._solver.cost(self._state, noise) > WORSE * self._solver.cost(before, noise):
-            flaw = "beside it all pixels are plainly worse"
-        else:
-            return
-        self._state, coat = before, self._decisions["coat"]
+            self._leave_coat("all pixels give it no weight")
+
+    def _leave_worse_coat(self) -> None:
+        """End the trial of a new coat, and leave it off if all pixels are plainly worse than before it."""
+        bare = self._bare
+        if bare is not None and self._solver.cost(self._state, bare.noise) > WORSE * bare.cost:
+            self._leave_coat("beside it all pixels are plainly worse")
+        self._bare = None
+
+    def _leave_coat(self, flaw: str) -> None:
+        self._take_best(self._bare)
+        self._bare, coat = None, self._decisions["coat"]
         self._decisions["coat"] = replace(coat, state="off", reason=f"{coat.reason}, but {flaw}")
 
     def _better(self, best: Best | None) -> Best:
