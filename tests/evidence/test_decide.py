@@ -146,6 +146,30 @@ def test_guides_are_sought_beside_no_gain_that_is_not_worth_its_place(example, m
     assert bases and not any(base.gain for base in bases)
 
 
+def test_guides_that_do_not_show_without_bounced_light_are_sought_beside_it(example, monkeypatch):
+    twin, caster, samples, glints = example
+    guides_mm, sets = ((2.0, 0.0, 0.0),), []
+
+    def found(probe, base, *_):
+        return AT_LENS if base.bounced is None else guides_mm
+
+    fit = Probe.fit
+
+    def fitted(probe, hypothesis):
+        sets.append(hypothesis)
+        return fit(probe, hypothesis)
+
+    monkeypatch.setattr("endotwin.evidence.decide.found_guides", found)
+    monkeypatch.setattr(Probe, "fit", fitted)
+    decide(samples, twin, caster, glints, {})
+    beside = [each for each in sets if each.guides_mm != AT_LENS]
+    assert {each.bounced is None for each in beside} == {False, True}
+    assert guides_mm in {each.guides_mm for each in beside if each.bounced is None}
+    sets.clear()
+    decide(samples, twin, caster, glints, {"interreflection": "off"})
+    assert all(each.guides_mm == AT_LENS for each in sets)
+
+
 def test_an_effect_that_is_forced_off_stays_off(example):
     twin, caster, samples, glints = example
     log_gain = np.random.default_rng(3).normal(0, 0.15, 64)
