@@ -143,14 +143,15 @@ class _Trial:
         them; at last beside the bounce of their own light.
 
         A gain that is not worth its place would explain what guides throw, and hide where they are. Where
-        bounced light is left out, a guide near the lens throws into the shadows what nothing else does.
+        bounced light is left out, a guide near the lens throws into the shadows what nothing else does, and
+        those farther out may not show.
         """
         best, _ = self._pruned(best, ("gain",))
         base = replace(self._model(best).hypothesis, vignetting=self.wanted("vignetting") != "off")
         bounces = base.bounced is not None
         found_mm = other_mm = self._found_guides(base, self.wanted("offset") == "on")
-        hidden = not (bounces and found_mm == AT_LENS)
-        if self.wanted("interreflection") == "auto" and hidden and not self._late():
+        none = bounces and found_mm == AT_LENS
+        if self.wanted("interreflection") == "auto" and not none and not self._late():
             other = replace(base, bounced=None if bounces else self._bouncing(AT_LENS))
             other_mm = self._found_guides(other, False)
         self._guides_mm = {bounces: _first(found_mm, other_mm), not bounces: _first(other_mm, found_mm)}

@@ -12,16 +12,19 @@ from itertools import combinations
 
 import numpy as np
 
-from endotwin.evidence.probe import TISSUE_SPREAD, VIGNETTING_SPREAD, Fitted, Probe, log_light
+from endotwin.evidence.probe import POSSIBLE, TISSUE_SPREAD, VIGNETTING_SPREAD, Fitted, Probe, log_light
 from endotwin.pixels.fixed_effects import Design, regress
 from endotwin.pixels.start import LIGHT_MEAN, LIGHT_SPREAD, PRIOR
 
 RINGS = ((0.0, 1), (0.5, 6), (1.0, 10), (1.5, 12), (2.0, 14), (2.6, 16))
-"""Radii and how many places lie on each. A tip's own guides stand as far from the lens as its rim."""
+"""Radii, in those of a search, and how many places lie on each; guides stand within the tip's rim."""
 
 ROUNDS, STILL = 15, 0.05
 """In so many at most shares are found, each linearised about the one before, and none after one that moves
 less of the light."""
+
+LEAST = 0.01
+"""Of the light that all places would throw on a pixel together: what shows light is lit by so much."""
 
 STEP = 1.0
 """Standard deviation by which a round changes a share."""
@@ -102,9 +105,11 @@ class _Light:
         design, probe = self._design(share, n, q), self.probe
         found = regress(probe.target, design, len(probe.frames), rounds=2).coefficients
         share, (by_n, by_q, gamma) = found[: len(share)], found[len(share) :][:3]
-        if not share.any() or gamma <= 0:
+        if not share.any() or gamma < POSSIBLE[0][0]:
             return np.full(len(share), 1 / len(share)), about
-        return share / share.sum(), (by_n / gamma, by_q / gamma, gamma)
+        low, high = np.transpose(POSSIBLE)
+        gamma, n, q = np.clip([gamma, by_n / gamma, by_q / gamma], low, high)
+        return share / share.sum(), (float(n), float(q), float(gamma))
 
     def _design(self, share: np.ndarray, n: float, q: float) -> Design:
         """Columns: of γ times each share; of γn, γq, γ, and γ times what retro is more than usual; of
@@ -112,7 +117,7 @@ class _Light:
         probe, hypothesis, bounced = self.probe, self.base.hypothesis, self.base.hypothesis.bounced
         direct = np.exp(self.cast + self.retro + n * self.axis - q * self.distance)
         beside = 0.0 if bounced is None else np.exp(bounced.at(n, q))
-        total = np.maximum(direct @ share + beside, np.finfo(float).tiny)
+        total = np.maximum(direct @ share, LEAST * direct.mean(axis=1)) + beside
         each = direct / total[:, None]
         slopes = (self.axis, -self.distance, self.retro)
         by_n, by_q, by_retro = (np.einsum("nk,nk,k->n", each, slope, share) for slope in slopes)
