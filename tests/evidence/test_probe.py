@@ -96,6 +96,18 @@ def test_a_map_of_the_light_shows_from_where_it_comes_and_where_its_guides_stand
         assert apart_mm.min(axis=0).max() < within_mm
 
 
+@pytest.mark.parametrize("spread", [0.0, 1e-6, 10.0])
+def test_a_map_of_the_light_is_one_whatever_the_photos_show(example, spread):
+    probe, radius_mm = copy.copy(example), 2.4
+    probe.target = spread * np.random.default_rng(3).normal(size=len(probe))
+    places = places_mm(radius_mm)
+    visible = np.stack([probe.visible(place) for place in places], axis=1)
+    visible[:: len(visible) // 1000] = False
+    found = LightMap.of(probe, probe.fit(Hypothesis()), places, visible)
+    assert (found.share >= 0).all() and found.share.sum() == pytest.approx(1)
+    assert all(np.isfinite(start_mm).all() for start_mm in found.guides_mm(3))
+
+
 def test_a_pixel_that_shows_light_is_not_taken_to_lie_in_full_shadow(example):
     assert not example.lit(BESIDE.guides_mm).all()
     cast, uncast = example.fit(BESIDE), example.fit(replace(BESIDE, shadows=False))
