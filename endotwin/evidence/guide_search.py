@@ -95,7 +95,7 @@ class Search:
         self._probe, self._base, self._glints = probe, probe.fit(base), glints
         self._radius_mm = radius_mm(probe)
         self._places_mm = places_mm(self._radius_mm)
-        self._lit = np.stack([probe.visible(place) for place in self._places_mm], axis=1)
+        self._lit = probe.visible_to(self._places_mm)
         self._at_risk = np.flatnonzero(~self._lit.all(axis=1))
         self.best = cache(self._best)
         self._seen = lru_cache(SEEN_GUIDES)(lambda guide: probe.visible(np.float32(guide), self._at_risk))

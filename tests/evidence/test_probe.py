@@ -87,7 +87,7 @@ def test_a_map_of_the_light_shows_from_where_it_comes_and_where_its_guides_stand
     probe.target = np.log((albedo * light)[rows]) / 2.2 + rng.normal(0, 0.01, len(rows))
     radius_mm = 2.4
     places = places_mm(radius_mm)
-    visible = np.stack([probe.visible(place) for place in places], axis=1)
+    visible = probe.visible_to(places)
     found = LightMap.of(probe, probe.fit(Hypothesis()), places, visible)
     apart_mm = np.linalg.norm(found.places_mm[:, None] - guides_mm, axis=2)
     assert found.share[apart_mm.min(axis=1) < radius_mm].sum() > 0.8
@@ -101,7 +101,7 @@ def test_a_map_of_the_light_is_one_whatever_the_photos_show(example, spread):
     probe, radius_mm = copy.copy(example), 2.4
     probe.target = spread * np.random.default_rng(3).normal(size=len(probe))
     places = places_mm(radius_mm)
-    visible = np.stack([probe.visible(place) for place in places], axis=1)
+    visible = probe.visible_to(places)
     visible[:: len(visible) // 1000] = False
     found = LightMap.of(probe, probe.fit(Hypothesis()), places, visible)
     assert (found.share >= 0).all() and found.share.sum() == pytest.approx(1)
