@@ -6,7 +6,15 @@ import numpy as np
 import pytest
 from scipy.optimize import lsq_linear
 
-from endotwin.pixels.fixed_effects import DENSE, Design, FixedEffects, regress, robust_losses, without_means
+from endotwin.pixels.fixed_effects import (
+    DENSE,
+    Design,
+    FixedEffects,
+    Left,
+    regress,
+    robust_losses,
+    without_means,
+)
 
 
 def made(count: int, groups: int, categories: int) -> tuple[np.ndarray, Design]:
@@ -43,6 +51,31 @@ def test_a_ridge_is_a_value_of_0_for_a_share_of_what_the_values_tell_of_a_coeffi
     found = regress(target, design, rounds=1).coefficients
     np.testing.assert_allclose(found, np.linalg.lstsq(rows, np.r_[target * root, 0])[0], atol=1e-6)
     assert abs(found[1]) < 0.7 * 2
+
+
+@pytest.mark.parametrize("categories", [None, 4])
+def test_what_other_columns_leave_is_what_a_regression_on_them_leaves(categories):
+    target, design = made(1200, 40, 4)
+    design = design if categories else replace(design, category=None)
+    here = Left.of(target, design, 0.1, categories or 0)
+    other = design.columns + 0.01 * np.random.default_rng(1).normal(size=(2, *design.columns.shape))
+    left = [Left.of(target, replace(design, columns=x), 0.1, categories or 0).residuals for x in other]
+    moved = np.stack(left, axis=1) - here.residuals[:, None]
+    wrong = np.linalg.norm(here.beside(other) - here.residuals[:, None] - moved)
+    assert wrong < 0.1 * np.linalg.norm(moved)
+
+
+def test_a_value_that_other_columns_throw_far_off_hardly_pulls_the_rest():
+    target, design = made(1200, 40, 4)
+    here = Left.of(target, design, 0.1, 4)
+    row = np.argmin(np.abs(here.residuals))
+    far, near = np.stack([design.columns] * 2)
+    far[row] += 1e3
+    near[row] += 0.5
+    moved = here.beside(np.stack([far, near])) - here.residuals[:, None]
+    rest = np.abs(moved[design.group != design.group[row]]).max(axis=0)
+    assert moved[row, 0] > 50
+    assert 0 < rest[0] < 1.01 * rest[1]
 
 
 def test_coefficients_that_are_not_below_0_are_those_of_bounded_least_squares():

@@ -14,6 +14,7 @@ from endotwin.light.forward import Lobes
 from endotwin.light.radiosity import Radiosity
 from endotwin.light.shading import F0_DIELECTRIC, ROUGHNESS_TISSUE
 from endotwin.pixels.start import PRIOR
+from endotwin.run.ahead import on_all_cores
 
 CELL = 0.15
 """Size of a patch as a share of the median viewing distance: 3 mm at 20 mm."""
@@ -32,46 +33,52 @@ def cell_mm(log_distance: np.ndarray) -> float:
     return CELL * float(np.exp(np.median(log_distance)))
 
 
-def bounced(probe: Probe, hypothesis: Hypothesis) -> Bounced:
-    """Indirect light at the probe's pixels, with n, q and γ at their priors.
+class Surroundings:
+    """The tissue that throws light on a probe's pixels, in patches."""
 
-    The plain closed form is biased by the bounce. The albedo is that of the photos; it starts without the
-    bounce and is corrected for it in a few fixed-point rounds. The specular lobe, of the usual tissue, sends
-    its share of the light back, and on to the camera: for each pixel, the irradiance is that under which base
-    colours alone would look as bright.
-    """
-    n, q, gamma = PRIOR["n"], PRIOR["q"], PRIOR["gamma"]
-    samples, roughness = probe.samples, torch.tensor(ROUGHNESS_TISSUE)
-    size_mm = cell_mm(samples.log_distance.numpy())
-    radiosity = Radiosity(probe.twin.surface, probe.caster, size_mm, PROBE_RAYS)
-    light = BouncedLight(radiosity, probe.T_local_camera, hypothesis.guides_mm, hypothesis.profile)
-    places = Places(radiosity.to_points(probe.local_points_mm, probe.local_normals), probe.frame)
-    patch = radiosity.patch_of[samples.triangle.numpy()]
-    linear = (np.maximum(samples.color.numpy(), 1) / 255.0) ** (1 / gamma)
-    lobes = Lobes(F0_DIELECTRIC)
-    glossy = np.full((radiosity.count, 1), lobes.glossy_albedo(roughness))
-    gloss = lobes.gloss(samples.cos, roughness).numpy()
-    direct_light = probe.direct_light(hypothesis, n, q)
+    def __init__(self, probe: Probe):
+        self._probe, samples, roughness = probe, probe.samples, torch.tensor(ROUGHNESS_TISSUE)
+        size_mm = cell_mm(samples.log_distance.numpy())
+        radiosity = Radiosity(probe.twin.surface, probe.caster, size_mm, PROBE_RAYS)
+        self._radiosity, self._patch = radiosity, radiosity.patch_of[samples.triangle.numpy()]
+        self._places = Places(radiosity.to_points(probe.local_points_mm, probe.local_normals), probe.frame)
+        self._linear = (np.maximum(samples.color.numpy(), 1) / 255.0) ** (1 / PRIOR["gamma"])
+        lobes = Lobes(F0_DIELECTRIC)
+        self._glossy = np.full((radiosity.count, 1), lobes.glossy_albedo(roughness))
+        self._gloss = lobes.gloss(samples.cos, roughness).numpy()
 
-    def seen(irradiance: np.ndarray, base_color: np.ndarray) -> np.ndarray:
-        """Irradiance [N, 3] as tissue of base colours [P, 3] shows it, [N]."""
-        color = places.weights @ base_color
-        return (irradiance * (color + gloss[:, None])).sum(axis=1) / color.sum(axis=1)
+    def bounced(self, hypothesis: Hypothesis) -> Bounced:
+        """Indirect light at the pixels, with n, q and γ at their priors.
 
-    def under(brightest: float) -> Bounced:
-        light_there = direct_light
+        The plain closed form is biased by the bounce. The albedo is that of the photos; it starts without the
+        bounce and is corrected for it in a few fixed-point rounds. The specular lobe, of the usual tissue,
+        sends its share of the light back, and on to the camera: for each pixel, the irradiance is that under
+        which base colours alone would look as bright.
+        """
+        probe = self._probe
+        guides = hypothesis.guides_mm, hypothesis.profile
+        light = BouncedLight(self._radiosity, probe.T_local_camera, *guides)
+        direct = probe.direct_light(hypothesis, PRIOR["n"], PRIOR["q"])
+        tried = list(on_all_cores(lambda each: self._under(light, direct, each), PROBE_ALBEDOS))
+        models = [probe.fit(replace(hypothesis, bounced=each)) for each in tried]
+        gains_db = [probe.compare(models[0], model).gain_db for model in models]
+        return tried[int(np.argmax(gains_db))]
+
+    def _under(self, light: BouncedLight, direct: np.ndarray, brightest: float) -> Bounced:
+        """Where the brightest tissue has that albedo, and ``direct`` [N] comes from the ``light`` itself."""
+        n, q, there = PRIOR["n"], PRIOR["q"], direct
         for _ in range(FIXED_POINT_ROUNDS):
-            base_color = _patch_albedo(linear, light_there, patch, radiosity.count, brightest)
-            albedo = Albedo(base_color, glossy)
-            light_there = direct_light + seen(light.at(places, n, q, albedo.scaled(0.0)), base_color)
-        found = light.expanded(places, n, q, albedo, by=("n", "q"))
-        log = np.log(np.maximum(seen(found.irradiance(n, q).numpy(), base_color), 1e-30))
+            base_color = _patch_albedo(self._linear, there, self._patch, self._radiosity.count, brightest)
+            albedo = Albedo(base_color, self._glossy)
+            there = direct + self._seen(light.at(self._places, n, q, albedo), base_color)
+        found = light.expanded(self._places, n, q, albedo, by=("n", "q"))
+        log = np.log(np.maximum(self._seen(found.irradiance(n, q).numpy(), base_color), 1e-30))
         return Bounced(log, found.by_n.numpy(), found.by_q.numpy())
 
-    tried = [under(brightest) for brightest in PROBE_ALBEDOS]
-    models = [probe.fit(replace(hypothesis, bounced=each)) for each in tried]
-    gains_db = [probe.compare(models[0], model).gain_db for model in models]
-    return tried[int(np.argmax(gains_db))]
+    def _seen(self, irradiance: np.ndarray, base_color: np.ndarray) -> np.ndarray:
+        """Irradiance [N, 3] as tissue of base colours [P, 3] shows it, [N]."""
+        color = self._places.weights @ base_color
+        return (irradiance * (color + self._gloss[:, None])).sum(axis=1) / color.sum(axis=1)
 
 
 def _patch_albedo(

@@ -14,7 +14,7 @@ from scipy.stats import chi2
 
 from endotwin.effects import Decision
 from endotwin.effects.coat import Coat
-from endotwin.evidence.probe import Verdict, held_out, verdict_of
+from endotwin.evidence.probe import Halved, Verdict, verdict_of
 from endotwin.pixels.fixed_effects import Design, regress, robust_losses
 
 ROUGHNESSES = (0.045, 0.06, 0.09, 0.13, 0.19, 0.27)
@@ -156,7 +156,9 @@ class _Search:
         half = np.random.default_rng(0).random(1 + max(seen.vertex.max() for seen, _ in both)) < 0.5
         before, after = (
             np.bincount(
-                seen.vertex, held_out(seen.residual, design, half[seen.vertex], self._width), len(half)
+                seen.vertex,
+                Halved.of(seen.residual, design, half[seen.vertex]).losses(self._width),
+                len(half),
             )
             for seen, design in both
         )

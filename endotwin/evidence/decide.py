@@ -12,7 +12,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, cached_property
 from itertools import combinations
 
 import numpy as np
@@ -26,9 +26,9 @@ from endotwin.effects.profile import Profile
 from endotwin.effects.shadows import Shadows
 from endotwin.effects.specular import Specular
 from endotwin.effects.vignetting import Vignetting
-from endotwin.evidence.bounce import bounced, cell_mm
+from endotwin.evidence.bounce import Surroundings, cell_mm
 from endotwin.evidence.glints import Glints
-from endotwin.evidence.guide_search import Guides, Search, found_guides, polished, settled
+from endotwin.evidence.guide_search import Ground, Guides, Search, found_guides, polished, settled
 from endotwin.evidence.log_light import Bounced
 from endotwin.evidence.probe import (
     MIN_GAIN_DB,
@@ -114,7 +114,7 @@ class _Trial:
         late: Callable[[], bool],
         near_mm: Guides,
     ):
-        self._probe, self._glints, self._wanted, self._late = probe, cache(glints), wanted, late
+        self._probe, self._glints, self._wanted, self._late = probe, glints, wanted, late
         self._near_mm = near_mm
         self._decisions: dict[str, Decision] = {}
         self._seconds = dict.fromkeys((*TOGETHER, *BESIDE), 0.0)
@@ -159,10 +159,14 @@ class _Trial:
             return
         own = Hypothesis(self._guides_mm[True], shadows=True, gain=base.gain)
         own = replace(own, bounced=self._bouncing(own.guides_mm))
-        self._guides_mm[True] = Search.of(self._probe, own, self._glints()).polished()
+        self._guides_mm[True] = Search(self._ground.part, own).polished()
 
     def _found_guides(self, base: Hypothesis, forced: bool) -> Guides:
-        return found_guides(self._probe, base, self._glints(), forced, self._near_mm)
+        return found_guides(self._ground, base, forced, self._near_mm)
+
+    @cached_property
+    def _ground(self) -> Ground:
+        return Ground(self._probe, self._glints())
 
     @property
     def _beside_lens(self) -> bool:
@@ -195,7 +199,7 @@ class _Trial:
         verdict = self._verdict_beside(name, kept, other)
         on = self.wanted(name) == "on" or _worth(name, verdict)
         if on and other.hypothesis.guides_mm != AT_LENS:
-            kept, other = self._settled(kept), self._settled(other)
+            kept, other = settled(self._ground, kept), settled(self._ground, other)
             verdict = self._verdict_beside(name, kept, other)
             on = self.wanted(name) == "on" or _worth(name, verdict)
         self._say(name, on, verdict)
@@ -222,12 +226,9 @@ class _Trial:
         if not kept.hypothesis.shadows or kept.hypothesis.guides_mm == AT_LENS or self._late():
             return kept
         began = time.perf_counter()
-        found = polished(self._probe, kept, self._glints())
+        found = polished(self._ground, kept)
         self._seconds["offset"] += time.perf_counter() - began
         return found
-
-    def _settled(self, model: Fitted) -> Fitted:
-        return settled(self._probe, model, self._glints())
 
     def decided(self, kept: Fitted) -> Decided:
         """The effects of ``kept``, each with the evidence for it or against it."""
@@ -265,7 +266,11 @@ class _Trial:
 
     def _bounced(self, guides_mm: Guides) -> Bounced:
         hypothesis = Hypothesis(guides_mm=guides_mm, shadows=guides_mm != AT_LENS)
-        return bounced(self._probe, replace(hypothesis, gain=self.wanted("gain") != "off"))
+        return self._surroundings.bounced(replace(hypothesis, gain=self.wanted("gain") != "off"))
+
+    @cached_property
+    def _surroundings(self) -> Surroundings:
+        return Surroundings(self._probe)
 
     def _best(self, sets: list[frozenset[str]]) -> frozenset[str]:
         """The set that predicts held-out pixels best; what no endoscope has counts MIN_IMPOSSIBLE_DB less."""
@@ -319,8 +324,8 @@ class _Trial:
     def _mixed(self, kept: Fitted) -> Hypothesis:
         """Beside ``kept``, the profile at the foot of the parabola through the losses of three."""
         profiles = (COSINE, (COSINE + EXPONENTIAL) / 2, EXPONENTIAL)
-        left = [self._probe.residuals(replace(kept.hypothesis, profile=p), kept) for p in profiles]
-        losses = [float((each**2).sum()) for each in left]
+        designs = [self._probe.linearised(replace(kept.hypothesis, profile=p), kept) for p in profiles]
+        losses = [float((self._probe.left(each, kept).residuals ** 2).sum()) for each in designs]
         bend, slope, _ = np.polyfit(profiles, losses, 2)
         foot = -slope / (2 * bend) if bend > 0 else profiles[int(np.argmin(losses))]
         return replace(kept.hypothesis, profile=float(np.clip(foot, COSINE, EXPONENTIAL)))

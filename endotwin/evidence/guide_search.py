@@ -12,6 +12,7 @@ from endotwin.evidence.glints import Glints
 from endotwin.evidence.light_map import LightMap, places_mm
 from endotwin.evidence.probe import Fitted, Hypothesis, Probe
 from endotwin.light.guides import AT_LENS
+from endotwin.pixels.fixed_effects import Design, Left
 
 Guides = tuple[tuple[float, float, float], ...]
 """Positions in the camera frame, mm."""
@@ -38,48 +39,85 @@ ASIDE = 0.1
 shadows that jump from pixel to pixel hide it."""
 
 
-def radius_mm(probe: Probe) -> float:
-    """RADIUS of the median viewing distance."""
-    return RADIUS * float(np.exp(np.median(probe.samples.log_distance.numpy())))
+class Ground:
+    """What guides are sought on: pixels of a probe and its glints, and which pixels places about the lens
+    see.
+
+    Args:
+        rows: which pixels of the probe that is meant by hypotheses about it these are; all, unless given.
+    """
+
+    def __init__(self, probe: Probe, glints: Glints, rows: np.ndarray | None = None):
+        self.probe, self.glints, self._rows = probe, glints, rows
+        self.radius_mm = RADIUS * float(np.exp(np.median(probe.samples.log_distance.numpy())))
+        self.places_mm = places_mm(self.radius_mm)
+        self._seen = lru_cache(SEEN_GUIDES)(lambda guide: probe.visible(np.float32(guide), self._at_risk))
+
+    @cached_property
+    def part(self) -> Ground:
+        """The same with some of the pixels."""
+        probe, rows = self.probe.part(SEARCH_PIXELS)
+        return Ground(probe, self.glints, rows)
+
+    @cached_property
+    def lit(self) -> np.ndarray:
+        """Bool [N, K]: which of the places see each pixel's point."""
+        return self.probe.visible_to(self.places_mm)
+
+    @cached_property
+    def _at_risk(self) -> np.ndarray:
+        return np.flatnonzero(~self.lit.all(axis=1))
+
+    def visible(self, guides_mm: np.ndarray) -> np.ndarray:
+        """Bool [N, K]: which of guides [K, 3] see each pixel's point; those that all places see, all do."""
+        visible = np.ones((len(self.probe), len(guides_mm)), bool)
+        for k, guide in enumerate(guides_mm):
+            visible[self._at_risk, k] = self._seen(tuple(map(float, guide)))
+        return visible
+
+    def of(self, hypothesis: Hypothesis) -> Hypothesis:
+        """The hypothesis about these pixels."""
+        if self._rows is None or hypothesis.bounced is None:
+            return hypothesis
+        return replace(hypothesis, bounced=hypothesis.bounced[self._rows])
 
 
-def found_guides(
-    probe: Probe, base: Hypothesis, glints: Glints, forced: bool, near_mm: Guides = AT_LENS
-) -> Guides:
+def found_guides(ground: Ground, base: Hypothesis, forced: bool, near_mm: Guides = AT_LENS) -> Guides:
     """Positions of one to three guides that predict held-out pixels better than ``base``, camera frame; the
-    lens where none do. They are sought where they explain the ``glints`` as well, and first ``near_mm``.
+    lens where none do. They are sought where they explain the glints as well, and first ``near_mm``.
 
     One guide, and a glance at two and three, tell whether a search is worth its time. Two in the plane of the
     lens pass for one behind it: another is believed only beside those before it where they are best. With
     ``forced`` there is always a position: that of the most guides, if none is worth it.
     """
+    probe = ground.probe
     plain, best = probe.fit(base), None
     if near_mm != AT_LENS:
         near = replace(base, guides_mm=near_mm, shadows=True)
-        near = replace(near, guides_mm=Search.of(probe, near, glints).settled())
+        near = replace(near, guides_mm=Search(ground.part, near).settled())
         if probe.compare(plain, probe.fit(near)).keep:
             return near.guides_mm
-    search = Search.of(probe, base, glints)
+    search = Search(ground.part, base)
     if not forced and not search.hints():
         return AT_LENS
     for number in range(1, MOST_GUIDES + 1):
         found = probe.fit(replace(base, guides_mm=search.best(number), shadows=True))
         worth = probe.compare(best or plain, found).keep
         if worth and best is not None:
-            worth = probe.compare(settled(probe, best, glints), found).keep
+            worth = probe.compare(settled(ground, best), found).keep
         if worth or (forced and best is None and number == MOST_GUIDES):
             best = found
-    return AT_LENS if best is None else Search.of(probe, best.hypothesis, glints).settled()
+    return AT_LENS if best is None else Search(ground.part, best.hypothesis).settled()
 
 
-def settled(probe: Probe, model: Fitted, glints: Glints) -> Fitted:
+def settled(ground: Ground, model: Fitted) -> Fitted:
     """``model`` with its guides where they predict best beside all its effects, if that is elsewhere."""
-    return _moved(probe, model, Search.of(probe, model.hypothesis, glints).settled())
+    return _moved(ground.probe, model, Search(ground.part, model.hypothesis).settled())
 
 
-def polished(probe: Probe, model: Fitted, glints: Glints) -> Fitted:
+def polished(ground: Ground, model: Fitted) -> Fitted:
     """``model`` with its guides where all of the probe's pixels say that they are, if that is elsewhere."""
-    return _moved(probe, model, Search(probe, model.hypothesis, glints).polished())
+    return _moved(ground.probe, model, Search(ground, model.hypothesis).polished())
 
 
 def _moved(probe: Probe, model: Fitted, guides_mm: Guides) -> Fitted:
@@ -89,27 +127,17 @@ def _moved(probe: Probe, model: Fitted, guides_mm: Guides) -> Fitted:
 
 
 class Search:
-    """Guide positions that predict a probe's pixels best, shadows included, and where its glints lie."""
+    """Guide positions that predict the pixels of a ``ground`` best beside the other effects of ``base``,
+    shadows included, and where its glints lie."""
 
-    def __init__(self, probe: Probe, base: Hypothesis, glints: Glints):
-        self._probe, self._base, self._glints = probe, probe.fit(base), glints
-        self._radius_mm = radius_mm(probe)
-        self._places_mm = places_mm(self._radius_mm)
-        self._lit = probe.visible_to(self._places_mm)
-        self._at_risk = np.flatnonzero(~self._lit.all(axis=1))
+    def __init__(self, ground: Ground, base: Hypothesis):
+        self._ground, self._probe = ground, ground.probe
+        self._base = self._probe.fit(ground.of(base))
         self.best = cache(self._best)
-        self._seen = lru_cache(SEEN_GUIDES)(lambda guide: probe.visible(np.float32(guide), self._at_risk))
-
-    @classmethod
-    def of(cls, probe: Probe, base: Hypothesis, glints: Glints) -> Search:
-        """A search with some of the probe's pixels, beside the other effects of ``base``."""
-        part, rows = probe.part(SEARCH_PIXELS)
-        base = base if base.bounced is None else replace(base, bounced=base.bounced[rows])
-        return cls(part, base, glints)
 
     @cached_property
     def _map(self) -> LightMap:
-        return LightMap.of(self._probe, self._base, self._places_mm, self._lit)
+        return LightMap.of(self._probe, self._base, self._ground.places_mm, self._ground.lit)
 
     def hints(self) -> bool:
         """Whether one guide, wherever it is best, or two or three where light gathers predict better."""
@@ -123,7 +151,7 @@ class Search:
 
     def _starts(self, number: int) -> list[np.ndarray]:
         """Where so many guides are sought from: where light gathers, and where the glints say."""
-        told = self._glints.guides_mm(number)
+        told = self._ground.glints.guides_mm(number)
         return [*self._map.guides_mm(number), *([told] if len(told) else [])]
 
     def settled(self) -> Guides:
@@ -138,12 +166,20 @@ class Search:
         """Guides moved from ``start_mm`` [K, 3] by Gauss–Newton, in the plane of the lens, or along 3
         axes."""
 
+        @lru_cache(1)
+        def left(x: bytes) -> Left:
+            return self._left(self._guides(np.frombuffer(x), axes))
+
         def residuals(x: np.ndarray) -> np.ndarray:
-            return self._residuals(self._guides(x, axes))
+            return np.r_[left(x.tobytes()).residuals, self._glints(self._guides(x, axes))]
 
         def slopes(x: np.ndarray) -> np.ndarray:
-            aside = [residuals(x + step) - residuals(x - step) for step in ASIDE * np.eye(len(x))]
-            return np.stack(aside, axis=1) / (2 * ASIDE)
+            steps = ASIDE * np.eye(len(x))
+            aside = [self._guides(x + step, axes) for step in np.r_[steps, -steps]]
+            pixels = left(x.tobytes()).beside(np.stack([self._design(each).columns for each in aside]))
+            glints = np.stack([self._glints(each) for each in aside], axis=1)
+            more, less = np.split(np.concatenate([pixels, glints]), 2, axis=1)
+            return (more - less) / (2 * ASIDE)
 
         first = self._coordinates(start_mm, axes)
         found = least_squares(residuals, first, slopes, xtol=TOLERANCE, ftol=TOLERANCE, max_nfev=STEPS)
@@ -151,25 +187,29 @@ class Search:
 
     def _coordinates(self, guides_mm: Guides | np.ndarray, axes: int) -> np.ndarray:
         """The first so many coordinates of K guides in radii, [K · axes]."""
-        return np.asarray(guides_mm, np.float64)[:, :axes].ravel() / self._radius_mm
+        return np.asarray(guides_mm, np.float64)[:, :axes].ravel() / self._ground.radius_mm
 
     def _guides(self, x: np.ndarray, axes: int) -> np.ndarray:
         """Guides float32 [K, 3] of those coordinates; none lies before the lens, or DEEPEST behind it."""
         x = x.reshape(-1, axes)
         guides = np.pad(x, ((0, 0), (0, 3 - axes))).astype(np.float32)
         guides[:, 2] = np.clip(guides[:, 2], -DEEPEST, 0)
-        return guides * np.float32(self._radius_mm)
+        return guides * np.float32(self._ground.radius_mm)
 
-    def _loss(self, guides_mm: np.ndarray) -> float:
-        return float((self._residuals(np.asarray(guides_mm)) ** 2).sum()) / 2
+    def _loss(self, guides_mm: Guides) -> float:
+        guides_mm = np.asarray(guides_mm, np.float32)
+        return float((self._left(guides_mm).residuals ** 2).sum() + (self._glints(guides_mm) ** 2).sum()) / 2
 
-    def _residuals(self, guides_mm: np.ndarray) -> np.ndarray:
-        """Of the pixels under these guides, and of the glints among as many."""
-        visible = np.ones((len(self._probe), len(guides_mm)), bool)
-        for k, guide in enumerate(guides_mm):
-            visible[self._at_risk, k] = self._seen(tuple(map(float, guide)))
-        diffuse = self._probe.residuals(self._with(guides_mm), self._base, visible)
-        return np.r_[diffuse, self._glints.residuals(guides_mm, len(self._probe))]
+    def _left(self, guides_mm: np.ndarray) -> Left:
+        """What light of these guides leaves of the pixels."""
+        return self._probe.left(self._design(guides_mm), self._base)
+
+    def _design(self, guides_mm: np.ndarray) -> Design:
+        return self._probe.linearised(self._with(guides_mm), self._base, self._ground.visible(guides_mm))
+
+    def _glints(self, guides_mm: np.ndarray) -> np.ndarray:
+        """Residuals of the glints among as many pixels."""
+        return self._ground.glints.residuals(guides_mm, len(self._probe))
 
     def _with(self, guides_mm: np.ndarray) -> Hypothesis:
         return replace(self._base.hypothesis, guides_mm=_plain(guides_mm), shadows=True)

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -26,10 +27,10 @@ from endotwin.light.guides import AT_LENS, COSINE, guided, log_axis
 from endotwin.pixels.fixed_effects import (
     Design,
     FixedEffects,
+    Left,
     pseudo_huber,
     regress,
     robust_losses,
-    robust_residuals,
 )
 from endotwin.pixels.samples import Samples, whole_groups
 from endotwin.pixels.start import LIGHT_MEAN, LIGHT_SPREAD, PRIOR, dark, diffuse
@@ -118,12 +119,23 @@ class Verdict:
 
 @dataclass(frozen=True)
 class Fitted:
-    """A hypothesis with its coefficients, the design that they belong to, and where that is linearised."""
+    """A hypothesis with its coefficients, the design that they belong to, and where that is linearised.
+
+    Attributes:
+        target: [N], what it explains. half: bool [N], of whole vertices: each half chooses for the other.
+    """
 
     hypothesis: Hypothesis
     design: Design
     effects: FixedEffects
     about: About
+    target: np.ndarray
+    half: np.ndarray
+
+    @cached_property
+    def halved(self) -> Halved:
+        """The design with the coefficients that either half of the vertices chooses."""
+        return Halved.of(self.target, self.design, self.half, len(self.effects.intercepts))
 
     @property
     def gamma(self) -> float:
@@ -203,27 +215,26 @@ class Probe(Sightings):
         for number in range(ROUNDS):
             held = about.tissue.at_bounds & (number == ROUNDS - 1)
             design = self._design(hypothesis, light, about, held)
-            found = Fitted(hypothesis, design, regress(self.target, design, len(self.frames)), about)
+            effects = regress(self.target, design, len(self.frames))
+            found = Fitted(hypothesis, design, effects, about, self.target, self._half)
             if found.gamma <= LEAST_GAMMA or number == ROUNDS - 1 or not len(self):
                 break
             about = About(found.n, found.q, found.tissue, self._albedo(found))
         return found
 
-    def residuals(
-        self, hypothesis: Hypothesis, base: Fitted, visible: np.ndarray | None = None
-    ) -> np.ndarray:
-        """Robust residuals [N], in widths of those of ``base``, linearised about it, under guides that see
-        the pixels as ``visible`` [N, K] says (found out unless given)."""
+    def linearised(self, hypothesis: Hypothesis, base: Fitted, visible: np.ndarray | None = None) -> Design:
+        """The design of a hypothesis about ``base``, under guides that see the pixels as ``visible`` [N, K]
+        says (found out unless given)."""
         about = base.about if base.possible else About()
-        light, held = log_light(self, hypothesis, visible), about.tissue.at_bounds
-        design = self._design(hypothesis, light, about, held)
-        found = regress(self.target, design, len(self.frames), rounds=2)
-        return robust_residuals(self.target, design, found, base.effects.width)
+        return self._design(hypothesis, log_light(self, hypothesis, visible), about, about.tissue.at_bounds)
+
+    def left(self, design: Design, base: Fitted) -> Left:
+        """What a design leaves of the pixels, in widths of what ``base`` does."""
+        return Left.of(self.target, design, base.effects.width, len(self.frames))
 
     def compare(self, base: Fitted, other: Fitted) -> Verdict:
         """How much better ``other`` predicts pixels of vertices that did not choose its coefficients."""
-        designs = base.design, other.design
-        verdict = compared(self.target, *designs, self._half, base.effects.width, len(self.frames))
+        verdict = compared(base.halved, other.halved, base.effects.width)
         return replace(verdict, possible=other.possible or not base.possible)
 
     def shaded_db(self, found: Fitted) -> float:
@@ -316,17 +327,38 @@ def log_light(sightings: Sightings, hypothesis: Hypothesis, visible: np.ndarray 
     return LogLight(Lit(samples.cos, lit), hypothesis.bounced)
 
 
-def compared(
-    target: np.ndarray, base: Design, other: Design, half: np.ndarray, width: float, categories: int = 0
-) -> Verdict:
-    """How much better ``other`` explains values of groups that did not choose its coefficients.
+@dataclass(frozen=True)
+class Halved:
+    """Values whose groups' halves choose coefficients for each other.
 
-    Args:
-        target: [N]. half: bool [N], of whole groups: each half chooses for the other. width: of the loss.
-        categories: number of the designs' categories.
+    Attributes:
+        target: [N]. half: bool [N], of whole groups. chosen: what half and the rest of them choose.
     """
-    before, after = (held_out(target, design, half, width, categories) for design in (base, other))
-    return verdict_of(np.bincount(base.group, before - after, base.count), float(after.sum()))
+
+    target: np.ndarray
+    design: Design
+    half: np.ndarray
+    chosen: tuple[FixedEffects, FixedEffects]
+
+    @classmethod
+    def of(cls, target: np.ndarray, design: Design, half: np.ndarray, categories: int = 0) -> Halved:
+        """``categories`` is the number of the design's."""
+        chosen = tuple(regress(target[part], design[part], categories) for part in (half, ~half))
+        return cls(target, design, half, chosen)
+
+    def losses(self, width: float) -> np.ndarray:
+        """Pseudo-Huber losses [N] of that ``width``, beside what the other half chose."""
+        losses = np.zeros(len(self.target))
+        for found, judged in zip(self.chosen, (~self.half, self.half), strict=True):
+            losses[judged] = robust_losses(self.target[judged], self.design[judged], found, width)
+        return losses
+
+
+def compared(base: Halved, other: Halved, width: float) -> Verdict:
+    """How much better ``other`` explains values of groups that did not choose its coefficients; ``width``: of
+    the loss."""
+    before, after, design = base.losses(width), other.losses(width), base.design
+    return verdict_of(np.bincount(design.group, before - after, design.count), float(after.sum()))
 
 
 def verdict_of(gained: np.ndarray, after: float) -> Verdict:
@@ -334,14 +366,3 @@ def verdict_of(gained: np.ndarray, after: float) -> Verdict:
     sigma = max(math.sqrt(float((gained**2).sum())), 1e-30)
     ratio = (float(gained.sum()) + after) / max(after, 1e-30)
     return Verdict(10 * math.log10(max(ratio, 1e-30)), float(gained.sum()) / sigma)
-
-
-def held_out(
-    target: np.ndarray, design: Design, half: np.ndarray, width: float, categories: int = 0
-) -> np.ndarray:
-    """Losses [N] of values whose coefficients the other half chose; arguments as for ``compared``."""
-    losses = np.zeros(len(target))
-    for part in (half, ~half):
-        found = regress(target[part], design[part], categories)
-        losses[~part] = robust_losses(target[~part], design[~part], found, width)
-    return losses

@@ -17,7 +17,7 @@ import numpy as np
 from endotwin.effects import Decision
 from endotwin.effects.tone import Tone
 from endotwin.evidence.coat import LEAST_SIGHTINGS
-from endotwin.evidence.probe import MIN_SIGMAS, Verdict, compared
+from endotwin.evidence.probe import MIN_SIGMAS, Halved, Verdict, compared
 from endotwin.pixels.fixed_effects import Design, regress
 
 ROUNDS, SETTLED = 4, 0.002
@@ -108,4 +108,5 @@ def _verdict(hues: Hues, passing: int) -> Verdict:
         return Verdict(0.0, 0.0)
     plain, bent = hues.design(passing, curve=False), hues.design(passing)
     half = (np.random.default_rng(0).random(plain.count) < 0.5)[plain.group]
-    return compared(hues.residual, plain, bent, half, regress(hues.residual, plain).width)
+    without, beside = (Halved.of(hues.residual, design, half) for design in (plain, bent))
+    return compared(without, beside, regress(hues.residual, plain).width)

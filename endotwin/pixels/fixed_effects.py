@@ -7,6 +7,7 @@ unknown albedos cost two histograms a column. A second kind of intercept (of fra
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy.optimize import nnls
@@ -86,22 +87,32 @@ def regress(target: np.ndarray, design: Design, categories: int = 0, rounds: int
     weight, width = trust, 1.0
     group, count, slopes = design.group, design.count, design.columns.shape[1]
     for _ in range(rounds):
-        within = without_means(np.c_[design.columns, target], weight, group, count)
-        normal, right = _normal_equations(within, weight, design, categories)
-        normal[np.diag_indices_from(normal)] += RIDGE * np.trace(normal) + 1e-12
-        if design.ridge is not None:
-            normal[np.diag_indices(slopes)] *= 1 + design.ridge
+        normal, right = _regularised(target[:, None], design, weight, categories, width)
+        right = right[:, 0]
         if design.prior is not None:
-            precision, pull = design.prior
-            normal[:slopes, :slopes] += width**2 * precision
-            right[:slopes] += width**2 * pull
+            right[:slopes] += width**2 * design.prior[1]
         solved = _solved(normal, right, design.positive)
         found = FixedEffects(solved[:slopes], np.r_[0.0, solved[slopes:]], 0.0)
         left = (target - design.explained(found))[:, None]
         left = np.abs(without_means(left, weight, group, count)[:, 0]) * np.sqrt(trust)
         width = max(1.4826 * float(np.median(left)), 1e-6) if len(left) else 1e-6
-        weight = trust * np.minimum(1, HUBER * width / np.maximum(left, 1e-12))
+        weight = trust * _held(left, width)
     return FixedEffects(found.coefficients, found.intercepts, width)
+
+
+def _regularised(
+    values: np.ndarray, design: Design, weight: np.ndarray, categories: int, width: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Normal matrix, with what is known of the coefficients, and right-hand sides of ``values`` [N, M]."""
+    within = without_means(np.c_[design.columns, values], weight, design.group, design.count)
+    normal, right = _normal_equations(within, weight, design, categories)
+    normal[np.diag_indices_from(normal)] += RIDGE * np.trace(normal) + 1e-12
+    slopes = design.columns.shape[1]
+    if design.ridge is not None:
+        normal[np.diag_indices(slopes)] *= 1 + design.ridge
+    if design.prior is not None:
+        normal[:slopes, :slopes] += width**2 * design.prior[0]
+    return normal, right
 
 
 def _solved(normal: np.ndarray, right: np.ndarray, positive: int) -> np.ndarray:
@@ -118,23 +129,25 @@ def _solved(normal: np.ndarray, right: np.ndarray, positive: int) -> np.ndarray:
 def _normal_equations(
     within: np.ndarray, weight: np.ndarray, design: Design, categories: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Normal matrix and right-hand side of ``within`` [N, C + 1] (the last is the target), and of the
+    """Normal matrix and right-hand sides of ``within`` [N, C + M] (the last M are targets), and of the
     categories after the first.
 
     Demeaning is a projection, so products of demeaned columns with plain dummies are those with demeaned
     ones.
     """
-    slopes, target = within[:, :-1], within[:, -1]
-    normal, right = (slopes * weight[:, None]).T @ slopes, slopes.T @ (weight * target)
+    count = design.columns.shape[1]
+    slopes, targets = within[:, :count], within[:, count:]
+    weighted = (slopes * weight[:, None]).T
+    normal, right = weighted @ slopes, weighted @ targets
     if design.category is None:
         return normal, right
     category = design.category
     sums = [np.bincount(category, weight * column, categories) for column in within.T]
-    border = np.stack(sums[:-1], axis=1)
+    border, border_right = np.stack(sums[:count], axis=1), np.stack(sums[count:], axis=1)
     shared = _shared(weight, design, categories)
     dummies = np.diag(np.bincount(category, weight, categories)) - shared.T @ shared
     full = np.block([[normal, border[1:].T], [border[1:], dummies[1:, 1:]]])
-    return full, np.r_[right, sums[-1][1:]]
+    return full, np.r_[right, border_right[1:]]
 
 
 def _shared(weight: np.ndarray, design: Design, categories: int) -> np.ndarray | csr_array:
@@ -148,11 +161,12 @@ def _shared(weight: np.ndarray, design: Design, categories: int) -> np.ndarray |
     return np.bincount(cell, weight, cells).reshape(design.count, categories)
 
 
-def robust_residuals(target: np.ndarray, design: Design, found: FixedEffects, width: float) -> np.ndarray:
-    """What is left [N] beside what was ``found``, each group at its own mean, in units of ``width``, that of
-    values of weight 1; shortened so that half its square is the pseudo-Huber loss."""
-    left, trust = (target - design.explained(found))[:, None], design.trust
-    residual = without_means(left, trust, design.group, design.count)[:, 0] * np.sqrt(trust) / width
+def robust_residuals(left: np.ndarray, design: Design, width: float) -> np.ndarray:
+    """What is ``left`` [N, M] of values beside what was found of the ``design``, each group at its own mean,
+    in units of ``width``, that of values of weight 1; shortened so that half the square of each is the
+    pseudo-Huber loss."""
+    within, root = without_means(left, design.trust, design.group, design.count), np.sqrt(design.trust)
+    residual = within * root[:, None] / width
     return np.sign(residual) * np.sqrt(2 * pseudo_huber(residual))
 
 
@@ -163,4 +177,53 @@ def pseudo_huber(residual: np.ndarray) -> np.ndarray:
 
 def robust_losses(target: np.ndarray, design: Design, found: FixedEffects, width: float) -> np.ndarray:
     """Pseudo-Huber losses [N] of what was ``found``, each group at its own mean."""
-    return width**2 / 2 * robust_residuals(target, design, found, width) ** 2
+    left = (target - design.explained(found))[:, None]
+    return width**2 / 2 * robust_residuals(left, design, width)[:, 0] ** 2
+
+
+@dataclass(frozen=True)
+class Left:
+    """What a design leaves of N values.
+
+    Attributes:
+        found: of the ``categories``. width: of the loss.
+    """
+
+    target: np.ndarray
+    design: Design
+    found: FixedEffects
+    width: float
+    categories: int
+
+    @classmethod
+    def of(cls, target: np.ndarray, design: Design, width: float, categories: int) -> Left:
+        return cls(target, design, regress(target, design, categories, rounds=2), width, categories)
+
+    @cached_property
+    def residuals(self) -> np.ndarray:
+        """Robust ones, [N]."""
+        left = (self.target - self.design.explained(self.found))[:, None]
+        return robust_residuals(left, self.design, self.width)[:, 0]
+
+    def beside(self, columns: np.ndarray) -> np.ndarray:
+        """``residuals`` [N, M] with other columns, M times [N, C]: coefficients and intercepts follow as if
+        these had stayed (Kaufman 1975), and no value pulls them harder than a robust fit lets it."""
+        design, found = self.design, self.found
+        changed = ((columns - design.columns) @ found.coefficients).T
+        here = (self.target - design.explained(found))[:, None]
+        here = without_means(here, design.trust, design.group, design.count)
+        there, width = here - changed, found.width / np.sqrt(design.trust)[:, None]
+        held = _held(here, width)
+        pulled = here - there * _held(there, width) / held
+        weight = design.trust * held[:, 0]
+        solved = np.linalg.solve(*_regularised(pulled, design, weight, self.categories, found.width))
+        slopes = len(found.coefficients)
+        followed = design.columns @ solved[:slopes]
+        if design.category is not None:
+            followed += np.pad(solved[slopes:], ((1, 0), (0, 0))).take(design.category, axis=0)
+        return robust_residuals(there + followed, design, self.width)
+
+
+def _held(left: np.ndarray, width: float | np.ndarray) -> np.ndarray:
+    """Share of what is ``left`` of values that a robust fit heeds."""
+    return np.minimum(1, HUBER * width / np.maximum(np.abs(left), 1e-12))
