@@ -11,6 +11,7 @@ from independent.write import make
 import endotwin
 from endotwin.effects import Decision
 from endotwin.effects.coat import Coat
+from endotwin.effects.tone import Tone
 from endotwin.fit import light_stage
 from endotwin.twin import Twin
 
@@ -60,3 +61,17 @@ def test_a_haze_brighter_than_water_does_not_ruin_a_bounce(tmp_path: Path, monke
     assert "coat" not in twin.effects or twin.effects["coat"].weight < 0.05 * haze.weight
     assert twin.response.gamma == pytest.approx(made["gamma"], rel=0.06)
     assert endotwin.evaluate(twin).psnr_covered > 36
+
+
+@pytest.mark.slow
+def test_a_false_tone_curve_is_taken_back_where_hues_ask_for_none_beside_it(
+    tmp_path: Path, monkeypatch
+) -> None:
+    said = Decision("on", "the hues say so", 1.1)
+    monkeypatch.setattr(light_stage, "judged_tone", lambda hues, wanted: (Tone(0.4), said))
+    monkeypatch.setattr(light_stage, "steadied", lambda tone, hues: Tone(0.05))
+    twin, made = fitted(tmp_path, 237, {"interreflection"})
+    assert twin.decisions["tone"].state == "off" and said.reason in twin.decisions["tone"].reason
+    assert "tone" not in twin.effects and "interreflection" in twin.effects
+    assert twin.response.gamma == pytest.approx(made["gamma"], rel=0.05)
+    assert endotwin.evaluate(twin).psnr_covered > 37

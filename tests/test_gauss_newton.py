@@ -17,10 +17,9 @@ from endotwin.fit.state import (
     DARKEST,
     GLOBAL_RANGE,
     State,
-    as_bouncing,
+    at_furnace,
     brightest,
     rescaled,
-    room_below_furnace,
     too_dark,
     without_furnace,
 )
@@ -63,34 +62,27 @@ def colored(factor: float, log_scale: float) -> State:
     return rescaled(State(None, torch.cat([shown, torch.zeros(100, 1)], dim=1), None, shared), log_scale)
 
 
-def bounced_off(state: State) -> np.ndarray:
-    """Mean albedo [3]."""
-    return state.materials[:, :3].mean(dim=0).numpy() * math.exp(state.shared.log_scale)
+@pytest.mark.parametrize(
+    ("rise", "channel"),
+    [([3.0, 1, 1], 0), ([0.1, 2.0, 0], 1), ([0.3, 0.3, 0.3], None), ([-1.0, 0.5, 0], None), ([], None)],
+)
+def test_a_step_is_stopped_by_the_channel_whose_tissue_it_would_make_a_furnace(rise, channel):
+    assert at_furnace(colored(0.8, 0.0), np.array(rise)) == channel
 
 
-@pytest.mark.parametrize("factor", [0.3, 0.8, 1.4])
-def test_light_bounces_after_a_step_as_the_step_took_it_to(factor):
-    before, after = colored(0.8, 0.0), colored(factor, 0.25)
-    wanted = bounced_off(rescaled(before, 0.25))
-    np.testing.assert_allclose(bounced_off(as_bouncing(after, before)), wanted, rtol=1e-5)
-
-
-@pytest.mark.parametrize("step", [-1.0, 0.05, 0.4, 3.0])
-def test_a_step_that_leaves_room_ends_below_the_furnace(step):
-    state = colored(0.8, 0.0)
-    share = room_below_furnace(state, step)
-    moved = rescaled(state, share * step)
-    assert 0 < share <= 1 and brightest(moved) * math.exp(moved.shared.log_scale) <= ALBEDO_MAX * (1 + 1e-6)
-    assert room_below_furnace(without_furnace(colored(0.8, 2.0)), 0.1) < 1e-6
+def test_tissue_without_a_furnace_reflects_at_most_what_tissue_may():
+    for log_scale in (-1.0, 0.1, 2.0):
+        moved = without_furnace(colored(0.8, log_scale))
+        assert brightest(moved) * math.exp(moved.shared.log_scale) <= ALBEDO_MAX * (1 + 1e-6)
 
 
 @pytest.mark.parametrize("unseen", [0.5, 20.0])
-def test_tissue_that_no_photo_shows_neither_limits_the_bounce_nor_counts_in_what_a_step_keeps(unseen):
+def test_tissue_that_no_photo_shows_neither_limits_the_bounce_nor_counts_in_what_light_follows(unseen):
     told = torch.arange(100) < 60
-    before, after = (replace(colored(factor, 0.1), told=told) for factor in (0.8, 1.1))
-    strange = replace(after, mean=torch.where(told[:, None], after.mean, unseen * after.mean))
-    assert brightest(strange) == brightest(after) != brightest(replace(strange, told=None))
-    assert as_bouncing(strange, before).shared.log_scale == as_bouncing(after, before).shared.log_scale
+    state = replace(colored(1.1, 0.1), told=told)
+    strange = replace(state, mean=torch.where(told[:, None], state.mean, unseen * state.mean))
+    assert brightest(strange) == brightest(state) != brightest(replace(strange, told=None))
+    torch.testing.assert_close(strange.mean_log_color, state.mean_log_color)
 
 
 def test_tissue_is_too_dark_by_what_it_reflects_not_by_its_scale():

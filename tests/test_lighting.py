@@ -171,3 +171,16 @@ def test_bright_tissue_and_the_light_that_it_throws_settle_where_they_agree(alik
     np.testing.assert_allclose(settled(follows=True), albedo, rtol=0.01)
     if alike:
         assert np.abs(settled(follows=False) - albedo)[0] > 0.1
+
+
+def test_light_follows_a_change_of_all_colours_in_full_and_of_one_place_in_half():
+    albedo, more = torch.tensor([0.8, 0.6, 0.2]).double(), 1e-4
+    color = torch.log(albedo)[None]
+    bounce = Bounce(
+        *[torch.zeros(1, 3)] * 3, 1 / (1 - albedo)[None], torch.zeros(1, 3), shown=color, tissue=color
+    )
+    changed = torch.exp(color + more)
+    full = torch.log(changed / (1 - changed)) - torch.log(albedo / (1 - albedo))
+    found = bounce.followed(color + more, 1.0, color[0] + more)
+    torch.testing.assert_close(torch.log(found), full, rtol=1e-3, atol=0)
+    torch.testing.assert_close(torch.log(bounce.followed(color + more, 1.0)), full / 2, rtol=1e-3, atol=0)

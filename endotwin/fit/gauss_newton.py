@@ -21,11 +21,12 @@ import scipy.linalg
 import torch
 from torch import Tensor
 
+from endotwin.fit.following import SHARE, Following
 from endotwin.fit.frame_gains import FramePattern
 from endotwin.fit.hashgrid import HashOperator
-from endotwin.fit.model import GLOBALS, Globals, at_pixels, predict
+from endotwin.fit.model import GLOBALS, Globals, at_pixels, columns_of, predict
 from endotwin.fit.normal_equations import CHANNELS, MeshPattern, NormalEquations, assemble, robust_cost
-from endotwin.fit.state import GLOBAL_RANGE, ROUGHNESS_RANGE, State, bounded, room_below_furnace
+from endotwin.fit.state import GLOBAL_RANGE, ROUGHNESS_RANGE, State, at_furnace, bounded, without_furnace
 from endotwin.light.shading import F0_DIELECTRIC
 from endotwin.pixels.samples import Samples, drawn
 from endotwin.pixels.start import LIGHT_MEAN, LIGHT_SPREAD, PRIOR
@@ -74,8 +75,8 @@ BLOCKS, OUTLYING, PASSING = 16, 3.0, 0.3
 """Blocks across a photo, in each of which a model errs alike; residuals so many standard deviations off are
 highlights', and count as that much; the share of the error, of its square, that passes for another γ."""
 
-MOST_BRIGHTER = 0.5
-"""Of the logarithm of bounced light, by a step of the albedo's scale: it grows faster than that."""
+MOST_BRIGHTER = 1.5
+"""Of the logarithm of bounced light, by a step of the albedo: it grows faster than that."""
 
 MOST_GAIN_STEP = 1.0
 """Of the logarithm of a gain: a photo all black or white tells none, and its slope is next to nothing."""
@@ -223,48 +224,79 @@ class GaussNewton:
         """
         given, state = state, self._here(state)
         noise = self._noise(state)
-        scale = 1 / (noise**2 * TEMPER)
-        if self._placed is None:
-            self._placed = self.samples.to(self._device)
-        equations = assemble(
-            self._placed,
-            self.pattern,
-            self._triangles,
-            state.materials,
-            state.shared,
-            HUBER * noise,
-            joint,
-            self._frames if gains else None,
-        )
-        free = free_directions(state.shared, self.held) if joint else np.zeros((len(state.shared.vector), 0))
-        began = time.perf_counter()
-        table_step, shared_step = self._solve(state, equations, scale, free)
-        self.solve_s = time.perf_counter() - began
-        room = room_below_furnace(state, float(shared_step[-1])) if joint and state.shared.bounces else 1.0
-        if room < LENGTHS[-1]:
-            room, free = 1.0, free_directions(state.shared, (*self.held, "albedo scale"))
-            table_step, shared_step = self._solve(state, equations, scale, free)
-        trusted = float((self._global_prior(state)[1] / shared_step.abs().clamp_min(1e-12)).min())
-        if joint and state.shared.bounces:
-            brighter = float(shared_step[-1].abs() * self._trial.bounce.by_scale.mean())
-            trusted = min(trusted, MOST_BRIGHTER / max(brighter, 1e-12))
-        gain_step = np.zeros(0)
+        equations = self._assembled(state, noise, joint, gains)
+        table_step, shared_step, rise = self._direction(state, equations, 1 / (noise**2 * TEMPER), joint)
+        trusted, gain_step = self._trusted(state, shared_step, rise), np.zeros(0)
         if gains:
-            vertex_step = state.link_slope * self._operator(table_step)
-            gain_step = equations.gains.step(vertex_step, shared_step.numpy())
+            columns = columns_of(state.shared, joint) @ shared_step.numpy()
+            if len(rise):
+                columns[-3:] += SHARE * (rise - columns[-3:])
+            gain_step = equations.gains.step(state.link_slope * self._operator(table_step), columns)
             trusted = min(trusted, MOST_GAIN_STEP / max(float(np.abs(gain_step).max()), 1e-12))
         before = self._cost(state, noise)
-        for length in (min(1.0, room, trusted) * each for each in LENGTHS):
+        for length in (min(1.0, trusted) * each for each in LENGTHS):
             moved = replace(
                 state,
                 table=state.table + length * table_step,
                 shared=bounded(state.shared, state.shared.vector + length * shared_step),
             )
+            moved = without_furnace(moved) if joint and self._follows else moved
             after = self._cost(moved, noise, length * gain_step)
             if after < before:
                 found = replace(given, table=moved.table.cpu(), shared=moved.shared)
                 return Step(found, before - after, length * gain_step)
         return Step(given, 0.0, 0 * gain_step)
+
+    def _assembled(self, state: State, noise: float, joint: bool, gains: bool) -> NormalEquations:
+        if self._placed is None:
+            self._placed = self.samples.to(self._device)
+        return assemble(
+            self._placed,
+            self.pattern,
+            self._triangles,
+            state.materials,
+            state.lighting,
+            HUBER * noise,
+            joint,
+            self._frames if gains else None,
+        )
+
+    def _direction(
+        self, state: State, equations: NormalEquations, scale: float, joint: bool
+    ) -> tuple[Tensor, Tensor, np.ndarray]:
+        """Steps of the table and of what is shared, and the ``_rise`` of albedo by them. Where tissue would
+        be a furnace, the albedo's scale makes up for what its colours gain."""
+        free = free_directions(state.shared, self.held) if joint else np.zeros((len(state.shared.vector), 0))
+        began = time.perf_counter()
+        table_step, shared_step = self._solve(state, equations, scale, free)
+        self.solve_s = time.perf_counter() - began
+        rise = self._rise(state, table_step, shared_step)
+        kept = at_furnace(state, rise) if joint else None
+        if kept is not None:
+            free = free_directions(state.shared, (*self.held, "albedo scale"))
+            table_step, shared_step = self._solve(state, equations, scale, free, kept)
+            rise = self._rise(state, table_step, shared_step)
+            shared_step[-1] -= rise[kept]
+            rise = rise - rise[kept]
+        return table_step, shared_step, rise
+
+    def _rise(self, state: State, table_step: Tensor, shared_step: Tensor) -> np.ndarray:
+        """What a step adds to ln of the mean albedo of each channel, [3]; [0] where light follows none."""
+        if not self._follows:
+            return np.zeros(0)
+        raw_step = self._operator(table_step)[:, :3]
+        whiter = (self._whiteness(state) * raw_step).sum(dim=0).cpu().numpy()
+        return whiter + float(shared_step[-1])
+
+    def _trusted(self, state: State, shared_step: Tensor, rise: np.ndarray) -> float:
+        """The share of a step, with the ``rise`` of albedo, for which the equations hold."""
+        moved, most = shared_step.clone(), math.inf
+        if len(rise):
+            moved[F0] += moved[-1]
+            moved[-1] = 0
+            brighter = self._trial.bounce.by_scale.mean(dim=0).cpu().numpy() * rise
+            most = MOST_BRIGHTER / max(float(np.abs(brighter).max()), 1e-12)
+        return min(most, float((self._global_prior(state)[1] / moved.abs().clamp_min(1e-12)).min()))
 
     @cached_property
     def _frames(self) -> FramePattern:
@@ -287,25 +319,37 @@ class GaussNewton:
         return self._known[1]
 
     def _displayed(self, samples: Samples, state: State) -> Tensor:
-        return predict(samples, at_pixels(samples, self._triangles, state.materials), state.shared)
+        return predict(samples, at_pixels(samples, self._triangles, state.materials), state.lighting)
 
     def _solve(
-        self, state: State, equations: NormalEquations, scale: float, free: np.ndarray
+        self,
+        state: State,
+        equations: NormalEquations,
+        scale: float,
+        free: np.ndarray,
+        kept: int | None = None,
     ) -> tuple[Tensor, Tensor]:
-        link = state.link_slope[..., None]
+        """Steps of the table, and of what is shared along ``free`` [G, K], beside a scale of the albedo by
+        which that of the channel ``kept`` stays on the whole what it is; None: by which it is as found."""
+        link, adjoint = state.link_slope[..., None], self._operator.adjoint_csr
+        shape, joint = (len(state.table), CHANNELS, -1), free.shape[1] > 0
+        sums = (equations.right * link * scale).reshape(len(link), -1)
+        sums = (adjoint @ sums).reshape(shape)
+        following = self._following(state, equations, scale, sums, kept)
 
         def product(x: Tensor) -> Tensor:
             rows, _, columns = x.shape
             vertex = (self._operator.forward_csr @ x.reshape(rows, -1)).reshape(-1, CHANNELS, columns)
             vertex = link * (equations @ (link * vertex)) * scale
-            back = self._operator.adjoint_csr @ vertex.reshape(len(vertex), -1)
-            return back.reshape(rows, CHANNELS, columns) + self.precision[..., None] * x
+            back = adjoint @ vertex.reshape(len(vertex), -1)
+            found = back.reshape(rows, CHANNELS, columns) + self.precision[..., None] * x
+            return found if following is None else found + following.product(x)
 
-        joint, right = free.shape[1] > 0, equations.right
-        if joint:
-            right = torch.cat([right[..., :1], right[..., 1:] @ self._placed_matrix(free)], dim=2)
-        right = (right * link * scale).reshape(len(link), -1)
-        right = (self._operator.adjoint_csr @ right).reshape(len(state.table), CHANNELS, -1)
+        columns = columns_of(state.shared, joint) @ free
+        right = torch.cat([sums[..., :1], sums[..., 1:] @ self._placed_matrix(columns)], dim=2)
+        if following is not None:
+            pulls = np.c_[equations.shared_right, equations.shared @ columns][-3:]
+            right += following.right(self._placed_matrix(scale * pulls))
         right[..., 0] -= self.precision * state.table
         block = equations.lumped() * (link * link.transpose(1, 2)) * scale
         block = (self.squared_adjoint @ block.reshape(len(link), -1)).reshape(-1, CHANNELS, CHANNELS)
@@ -316,12 +360,33 @@ class GaussNewton:
             return solved[..., 0], torch.zeros_like(state.shared.vector)
         mean, precision = self._prior(state, scale)
         pull = (precision * (mean - state.shared.vector)).numpy()
-        shared_normal = equations.shared * scale + np.diag(precision)
-        shared_right = free.T @ (equations.shared_right * scale + pull)
-        weights, along = _joint_minimum(
-            solved, product(solved), right, free.T @ shared_normal @ free, shared_right
-        )
+        shared_normal = columns.T @ equations.shared @ columns * scale + free.T @ np.diag(precision) @ free
+        shared_right = columns.T @ equations.shared_right * scale + free.T @ pull
+        weights, along = _joint_minimum(solved, product(solved), right, shared_normal, shared_right)
         return solved @ self._placed_matrix(weights), torch.from_numpy(free @ along)
+
+    def _following(
+        self, state: State, equations: NormalEquations, scale: float, sums: Tensor, kept: int | None
+    ) -> Following | None:
+        """How bounced light follows the mean colour of the tissue, from the ``sums`` at the table; None where
+        it follows none."""
+        if not self._follows:
+            return None
+        along = self._operator.adjoint_csr @ self._whiteness(state)
+        inner = self._placed_matrix(scale * equations.shared[-3:, -3:])
+        turn = Following.turning(kept).to(self._device)
+        return Following(along, turn, sums[..., -3:].contiguous(), inner)
+
+    @property
+    def _follows(self) -> bool:
+        """Whether light bounces, and follows the colours that throw it."""
+        return self.samples.bounce is not None and self.samples.bounce.shown is not None
+
+    def _whiteness(self, state: State) -> Tensor:
+        """d mean ln of each channel of what photos tell of / dθ, [V, 3]."""
+        told = torch.ones(len(state.materials)) if state.told is None else state.told
+        share = (told / told.sum()).to(self._device)[:, None]
+        return share * state.link_slope[:, :3] / state.materials[:, :3]
 
     def _placed_matrix(self, values: np.ndarray) -> Tensor:
         return torch.from_numpy(values).float().to(self._device)

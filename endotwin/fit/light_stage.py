@@ -16,19 +16,16 @@ import torch
 from endotwin.effects import Decision, Effects
 from endotwin.effects.tone import Tone
 from endotwin.evidence.coat import judged as judged_coat
-from endotwin.evidence.tone import Hues, steadied
+from endotwin.evidence.tone import LEAST_CONTRAST, Hues, steadied
 from endotwin.evidence.tone import judged as judged_tone
 from endotwin.fit.gauss_newton import GaussNewton
 from endotwin.fit.hashgrid import HashGrid, HashOperator
 from endotwin.fit.lighting import Relighting
-from endotwin.fit.mixing import Mixing
 from endotwin.fit.model import Globals, at_pixels
 from endotwin.fit.state import (
     State,
-    as_bouncing,
     brightest,
     halfway,
-    mixed,
     rescaled,
     roughness_to_raw,
     too_dark,
@@ -55,11 +52,13 @@ PALE = 0.75
 """Brightest channel of the even tissue from which the strength of a bounce is sought: it is found in fewer
 steps from above than from below."""
 
-HOLD_STEPS = 1
-"""Before these the scale of the albedo, which tells how light bounces, is held."""
+HOLD_STEPS = 3
+"""In which n and γ stay, and how strongly light bounces is found: steps that find both at once may end beside
+another n and half of the bounce."""
 
-COAT_STEP, BOUNCE_COAT_STEP = 2, 4
-"""A coat that nobody asked for is judged when light and materials are near."""
+COAT_STEP, NEAR, LATEST = 2, 0.1, 8
+"""A coat that nobody asked for, and a tone curve, are judged when light and materials are near: after so many
+steps; or, where light bounces, after one by which the cost fell by a smaller share, or at the latest."""
 
 BOUNCE_HELD = ("q", "L0")
 """Where light bounces, q stays where the fit starts, at the inverse square of a small light: what the bounce
@@ -71,9 +70,6 @@ no new coat is kept beside which they cost so many times what they did without."
 
 COATED_STEPS = 2
 """In which materials learn to do without what a new coat shows, before all pixels judge it."""
-
-SETTLING = 4
-"""Steps at most of the materials under a light that was found beside a bounce."""
 
 LEAVING = 2
 """Steps in which light learns to do without what is faint, before the materials do."""
@@ -146,8 +142,8 @@ class LightStage:
         samples: that tell the light, under it. clipped: those that only say 'at least', not lit, to which a
             coat is held, too.
         wanted: auto, on or off, of coat and tone. before: what was found before without the tone curve that
-            this found. Where light bounces and time is short, the search goes on from there; it ends better
-            where it begins anew.
+            this found. Where light bounces the search goes on from there, and where time is short the coat is
+            judged at once.
 
     Attributes:
         cost: what its first step took.
@@ -180,10 +176,8 @@ class LightStage:
             samples, triangles, operator, self._unit_mm, out_of_time=pace.light_is_over, device=device
         )
         set_up = pace.stopwatch.total
-        self._near = (
-            pace.hurried and before is not None and before.state.shared.bounces and relighting.bounces
-        )
-        if self._near:
+        self._goes_on = before is not None and before.state.shared.bounces and relighting.bounces
+        if self._goes_on:
             shared = replace(before.state.shared, tone=tone)
             self._state = replace(before.state, operator=operator, shared=shared)
         else:
@@ -211,14 +205,17 @@ class LightStage:
             late = self._late
             if late and number:
                 break
-            if (toned := self._newly_toned(number, COAT_STEP)) is not None:
+            ready = number >= COAT_STEP
+            if ready and (toned := self._newly_toned()) is not None:
                 return toned
-            shared = self._judged(number, COAT_STEP)
+            if ready and self._took_tone_back():
+                number = 0
+            shared = self._judged(ready)
             self._renew(shared, self._undetermined, self._noise)
             if late:
                 break
             self._state, gain = self._stepped(self._state, joint=False)
-            number = self._next(number, STEPS, COAT_STEP, self._converged(gain))
+            number = self._next(number, STEPS, COAT_STEP, self._changed_by_less(gain, CONVERGED))
         self._without_faint()
         return None
 
@@ -226,16 +223,19 @@ class LightStage:
         """Light and materials in one step, for the strength of the bounce. Ends early where photos show no
         bounce. Coat and tone are judged beside a response that is held near that of displays, for which they
         could pass; then photos are believed as far as the model explains them."""
-        number, best = BOUNCE_COAT_STEP if self._near else 0, None
+        number, near, trial, best = 0, self._goes_on and self._pace.hurried, COATED_STEPS, None
         while number < BOUNCE_STEPS and not self._late:
-            if (toned := self._newly_toned(number, BOUNCE_COAT_STEP)) is not None:
+            if near and (toned := self._newly_toned()) is not None:
                 return toned
-            shared = self._judged(number, BOUNCE_COAT_STEP)
-            scale = ("albedo scale",) * (number < HOLD_STEPS)
-            self._solver.held = (*self._undetermined, *BOUNCE_HELD, *scale)
+            if near and self._took_tone_back():
+                number, near = 0, False
+            shared = self._judged(near)
+            holding = number < HOLD_STEPS and not self._goes_on
+            held = ("n", "gamma") if holding else self._undetermined
+            self._solver.held = (*held, *BOUNCE_HELD)
             if shared.coat:
                 self._shine(shared)
-            if number >= BOUNCE_COAT_STEP:
+            if near:
                 self._solver.learn_error(self._state)
             self._state, gain = self._stepped(self._state, joint=True)
             if too_dark(self._state) and self._bare is not None:
@@ -243,31 +243,21 @@ class LightStage:
             elif too_dark(self._state):
                 self._state = self._relighting.without_bounce(self._solver, self._state)
                 return None
-            if number + 1 >= BOUNCE_COAT_STEP + COATED_STEPS:
+            if self._bare is not None and (trial := trial - 1) == 0:
                 self._leave_worse_coat()
-            if number >= BOUNCE_COAT_STEP and self._bare is None:
+            if near and self._bare is None:
                 best = self._better(best)
-            done = self._converged(gain) or _steady(shared, self._state.shared)
-            number = self._next(number, BOUNCE_STEPS, BOUNCE_COAT_STEP, done)
+            steady = self._changed_by_less(gain, CONVERGED) or _steady(shared, self._state.shared)
+            number = self._next(number, BOUNCE_STEPS, number + 1, steady and not holding)
+            near = near or number >= LATEST or (self._changed_by_less(gain, NEAR) and not holding)
         self._leave_worse_coat()
-        if number > BOUNCE_COAT_STEP:
-            best = self._better(best)
-            if not self._late:
-                self._settle()
+        if best is not None:
             self._take_best(self._better(best))
         return None
 
-    def _settle(self) -> None:
-        """Materials beside a bounce, until they and what they throw on each other agree."""
-        mixing = Mixing()
-        for _ in range(SETTLING):
-            self._state, gain = self._stepped(self._state, joint=False, mixing=mixing)
-            if self._converged(gain):
-                break
-
-    def _converged(self, gain: float) -> bool:
-        """Whether a step by which the cost fell by ``gain`` changed hardly anything."""
-        return abs(gain) < CONVERGED * self._solver.cost(self._state, self._noise)
+    def _changed_by_less(self, gain: float, share: float) -> bool:
+        """Whether a step by which the cost fell by ``gain`` changed it by less than that share of it."""
+        return abs(gain) < share * self._solver.cost(self._state, self._noise)
 
     def _without_faint(self) -> None:
         """The light that predicts best without what is too faint to be an effect, if there is any; γ stays as
@@ -329,23 +319,38 @@ class LightStage:
             return number + 1
         return steps if len(self._decisions) == len(self._wanted) else max(number + 1, coat_step)
 
-    def _newly_toned(self, number: int, step: int) -> Toned | None:
-        """A tone curve and why, if this is the ``step`` in which it is judged, and there is one."""
-        if number < step or "tone" in self._decisions:
+    def _newly_toned(self) -> Toned | None:
+        """A tone curve and why, if it is not judged yet, and there is one."""
+        if "tone" in self._decisions:
             return None
         tone, self._decisions["tone"] = judged_tone(self._hues(), self._wanted["tone"])
         return None if tone is None else (tone, self._decisions["tone"])
 
-    def _judged(self, number: int, step: int) -> Globals:
-        """Light and response as they are, with the tone curve that is right beside them, and the coat, which
-        is judged in the ``step``."""
-        shared = self._state.shared
-        if shared.tone is not None and number >= step:
-            shared = replace(shared, tone=steadied(shared.tone, self._hues()))
-            self._state = replace(self._state, shared=shared)
-        if "coat" not in self._decisions and number >= (0 if self._wanted["coat"] == "on" else step):
-            shared = self._coated()
-        return shared
+    def _judged(self, ready: bool) -> Globals:
+        """Light and response as they are, with the coat, which is judged when they are ``ready``; one that is
+        forced on, at once."""
+        if "coat" not in self._decisions and (ready or self._wanted["coat"] == "on"):
+            return self._coated()
+        return self._state.shared
+
+    def _took_tone_back(self) -> bool:
+        """Bend the tone curve, if there is one, to where hues are steadiest, unless all pixels are plainly
+        worse so: what the bounce lacks turns hues as well. Where they ask for none beside what was found
+        without it, it is taken back; whether it was."""
+        before, noise = self._state, self._noise
+        if before.shared.tone is None:
+            return False
+        tone = steadied(before.shared.tone, self._hues())
+        if tone.contrast < LEAST_CONTRAST and self._wanted["tone"] != "on":
+            said = self._decisions["tone"]
+            reason = f"{said.reason}, but beside what was found without it hues ask for none"
+            self._decisions["tone"] = replace(said, state="off", reason=reason)
+            self._state = replace(before, shared=replace(before.shared, tone=None))
+            return True
+        self._state = replace(before, shared=replace(before.shared, tone=tone))
+        if self._solver.cost(self._state, noise) > WORSE * self._solver.cost(before, noise):
+            self._state = before
+        return False
 
     def _hues(self) -> Callable[[Tone], Hues]:
         within, material = self._within()
@@ -363,14 +368,19 @@ class LightStage:
         return replace(state.shared, coat=layer)
 
     def _shine(self, shared: Globals) -> None:
-        """Take ``shared`` with the f0, coat and roughness that all pixels ask for; a coat that is new, which
-        highlights alone have found, for a trial, unless they give it no weight."""
+        """Take ``shared`` with the f0, coat and roughness that all pixels ask for, if beside the light that
+        then bounces they say so, too; a coat that is new, which highlights alone have found, for a trial,
+        unless they give it no weight."""
         before, noise = self._state, self._noise
+        bare = Best(before, self._relighting.effects, self._solver.cost(before, noise), noise)
         within, material = self._within()
         self._take(within.shone(material, shared, noise))
+        self._relighting(self._solver, self._state)
         if before.shared.coat is not None or self._wanted["coat"] == "on":
+            if before.shared.coat is not None and self._solver.cost(self._state, noise) > WORSE * bare.cost:
+                self._take_best(bare)
             return
-        self._bare = Best(before, self._relighting.effects, self._solver.cost(before, noise), noise)
+        self._bare = bare
         if self._state.shared.coat.weight == 0:
             self._leave_coat("all pixels give it no weight")
 
@@ -394,16 +404,14 @@ class LightStage:
             return best
         return Best(self._state, self._relighting.effects, cost, noise)
 
-    def _stepped(self, state: State, joint: bool, mixing: Mixing | None = None) -> tuple[State, float]:
+    def _stepped(self, state: State, joint: bool) -> tuple[State, float]:
         """A step, of the materials alone where a ``joint`` one finds nothing lower, with the samples relit by
         what it has found; and by how much the cost fell (below 0: it rose).
 
-        A joint step knows what it does to bounced light to first order. Where that was too far, it goes half
-        the way. One of the materials that is ``mixing`` with those before it takes bounced light as it is.
+        A step knows what it does to bounced light to first order. Where that was too far, it goes half the
+        way.
         """
         solver, relighting = self._solver, self._relighting
-        if mixing is not None:
-            solver.relight(solver.samples.under_still_bounce())
         found = solver.step(state, joint, gains=joint and "gain" in relighting.effects)
         if joint and not found.fell:
             found = solver.step(state, joint=False)
@@ -412,10 +420,6 @@ class LightStage:
         if not relighting.bounces:
             relighting(solver, moved)
             return moved, found.fell
-        if not joint:
-            moved = as_bouncing(moved, state)
-        if mixing is not None:
-            moved = mixed(mixing, state, moved)
         noise = solver.noise(state)
         before = solver.cost(state, noise)
         for halving in range(HALVINGS + 1):

@@ -182,7 +182,9 @@ class Relighting:
             return samples
         materials = state.materials
         roughness = at_pixels(samples, triangles, materials[:, 3:])[:, 0]
-        return self._bouncer.bounced(samples, roughness, materials, triangles, state.shared)
+        lit = self._bouncer.bounced(samples, roughness, materials, triangles, state.shared)
+        tissue = (state.shared.gamma * state.mean_log_color).float().expand(len(samples), 3)
+        return replace(lit, bounce=replace(lit.bounce, tissue=tissue))
 
     def relit(self, samples: Samples, triangles: Tensor, state: State) -> Samples:
         """``bounced``, and with the gain and what is faint as they were found last."""

@@ -6,6 +6,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -28,13 +29,15 @@ class Globals:
     """What all pixels share, as one vector float64 [5] in the order of GLOBALS, or [6] of BOUNCE_GLOBALS.
 
     Without ``specular`` there is no specular lobe, and ln f0 stays where it is. A ``coat`` adds a lobe of its
-    own; a ``tone`` bends what x^γ displays.
+    own; a ``tone`` bends what x^γ displays. ``tissue`` [3] is the mean of ln of the base colours that bounced
+    light follows; None: what it was when that was found.
     """
 
     vector: Tensor
     specular: bool = True
     coat: Coat | None = None
     tone: Tone | None = None
+    tissue: Tensor | None = None
 
     @classmethod
     def of(
@@ -86,6 +89,13 @@ class Globals:
         return (*self.log_light[1:], self.log_scale, self.gamma)
 
 
+def columns_of(shared: Globals, bordered: bool) -> np.ndarray:
+    """What the columns of ``Linearised.by_shared`` are of the shared parameters, [columns, G]."""
+    plain = np.eye(len(GLOBALS), len(shared.vector))[: len(GLOBALS) * bordered]
+    scale = np.eye(len(shared.vector))[len(GLOBALS) :]
+    return np.concatenate([plain, *[scale] * 3])
+
+
 def at_pixels(samples: Samples, triangles: Tensor, per_vertex: Tensor) -> Tensor:
     """Vertex values [V, C] interpolated at the samples, [N, C]; ``triangles`` int64 [F, 3]."""
     corners = per_vertex[triangles[samples.triangle]]
@@ -111,7 +121,7 @@ def _lit(samples: Samples, base_color: Tensor, shared: Globals) -> Lit:
     lit, bounce = samples.lit(*shared.bouncing), samples.bounce
     if bounce is None or bounce.shown is None:
         return lit
-    factor = bounce.followed(torch.log(base_color), shared.gamma)
+    factor = bounce.followed(torch.log(base_color), shared.gamma, shared.tissue)
     return replace(lit, irradiance=lit.irradiance * factor, mirrored=lit.mirrored * factor)
 
 
@@ -152,6 +162,13 @@ class Linearised:
     by_roughness: Tensor
     by_globals: Tensor
     by_coat: Tensor | None
+
+    def by_shared(self, bordered: bool) -> Tensor:
+        """dC by the shared parameters, if the equations are ``bordered`` by them, with the albedo's scale
+        apart for each channel: [N, 3, G]."""
+        count = len(GLOBALS)
+        plain, scale = self.by_globals[..., : count * bordered], self.by_globals[..., count:]
+        return torch.cat([plain, torch.diag_embed(scale[..., 0])], dim=2) if scale.shape[2] else plain
 
     def toned(self, tone: Tone | None) -> Linearised:
         """The same as the ``tone`` curve displays it."""

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from endotwin.fit.frame_gains import FrameBorder, FramePattern, FrameSums
-from endotwin.fit.model import Globals, at_pixels, linearise
+from endotwin.fit.model import Globals, at_pixels, columns_of, linearise
 from endotwin.pixels.samples import Samples
 from endotwin.pixels.start import DIFFUSE_SIN2
 from endotwin.run.ahead import on_all_cores
@@ -100,8 +100,8 @@ class NormalEquations:
     Attributes:
         color: three CSR [V, V], base colour by base colour. mixed: three CSR, base colour by roughness.
         roughness: CSR [V, V].
-        right: float32 [V, 4, 1 + G], JᵀW(e | dC by the G shared parameters) by channel.
-        shared: float64 [G, G] and shared_right [G], those of the shared parameters.
+        right: float32 [V, 4, 1 + G], JᵀW(e | dC by the G columns of ``Linearised.by_shared``) by channel.
+        shared: float64 [G, G] and shared_right [G], those of the G columns.
         gains: of frames, eliminated from all of them; None: there are none.
     """
 
@@ -202,10 +202,10 @@ class _Products:
         materials: Tensor,
         shared: Globals,
         width: float,
-        globals_count: int,
+        bordered: bool,
         gains: bool,
     ) -> _Products:
-        """Linearised as ``assemble`` says, which has the same arguments; G is the ``globals_count``."""
+        """Linearised as ``assemble`` says, which has the same arguments."""
         model = linearise(samples, at_pixels(samples, triangles, materials), shared)
         residual = Residual.of(samples, model.predicted, width)
         by_roughness = model.by_roughness
@@ -216,7 +216,7 @@ class _Products:
         products = [weighted_color[:, c] * model.by_color[:, c] for c in range(3)]
         products += [weighted_color[:, c] * by_roughness[:, c] for c in range(3)]
         products.append((weighted_roughness * by_roughness).sum(dim=1))
-        slopes = model.by_globals[..., :globals_count]
+        slopes = model.by_shared(bordered)
         against = torch.cat([residual.error[..., None], slopes], dim=2)
         by_color = weighted_color[..., None] * against
         by_all = (weighted_roughness[..., None] * against).sum(dim=1, keepdim=True)
@@ -249,13 +249,14 @@ def assemble(
     bordered: bool = True,
     frames: FramePattern | None = None,
 ) -> NormalEquations:
-    """Linearise at vertex ``materials`` [V, 4] and ``shared``, and sum over the samples; G is 0 unless
-    ``bordered``. Gains of the samples' ``frames`` are eliminated; None: they stay.
+    """Linearise at vertex ``materials`` [V, 4] and ``shared``, and sum over the samples; unless ``bordered``
+    there are no columns of what is shared, but of the scale of bounced light. Gains of the samples'
+    ``frames`` are eliminated; None: they stay.
 
     Beside bounced light, pixels beyond DIFFUSE_SIN2 tell no roughness: it is known by patches only, and errs
     by more than the little that roughness does to Burley's diffuse lobe.
     """
-    count, globals_count = len(pattern.corners), len(shared.vector) if bordered else 0
+    count, globals_count = len(pattern.corners), len(columns_of(shared, bordered))
     device = materials.device
     pair_sums = torch.zeros(count, len(CORNER_PAIRS), 7, device=device)
     corner_sums = torch.zeros(count, 3, CHANNELS * (1 + globals_count), device=device)
@@ -264,7 +265,7 @@ def assemble(
     normal, right = np.zeros((globals_count,) * 2), np.zeros(globals_count)
 
     def one(part: Samples) -> _Products:
-        return _Products.of(part, triangles, materials, shared, width, globals_count, frames is not None)
+        return _Products.of(part, triangles, materials, shared, width, bordered, frames is not None)
 
     parts = (map if device.type != "cpu" else on_all_cores)(one, samples.chunks(CHUNK))
     for start, part in zip(range(0, len(samples), CHUNK), parts, strict=True):

@@ -280,10 +280,11 @@ class _Fit:
         if finer is None:
             return State(None, at_vertices, None, coarse.shared), normals, None
         operator, samples = finer
-        state = State(operator, at_vertices, torch.zeros(operator.forward_csr.shape[1], 4), coarse.shared)
         relighting.keep_light()
         unit, mesh = unit_mm(surface), surface.triangles
         solver = GaussNewton(samples, mesh, operator, unit, 0, pace.out_of_time, self.device)
+        table = torch.zeros(operator.forward_csr.shape[1], 4)
+        state = State(operator, at_vertices, table, coarse.shared, solver.pattern.told)
         step_s = 0.0
         for number in range(pace.plan.steps):
             if pace.left(ITERATIONS) <= step_s / 2:

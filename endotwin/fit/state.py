@@ -12,7 +12,6 @@ import torch
 from torch import Tensor
 
 from endotwin.fit.hashgrid import HashOperator
-from endotwin.fit.mixing import Mixing
 from endotwin.fit.model import Globals
 from endotwin.light.radiosity import ALBEDO_MAX
 
@@ -70,6 +69,16 @@ class State:
         return color if self.told is None else color[self.told]
 
     @cached_property
+    def mean_log_color(self) -> Tensor:
+        """Mean of ln of the base colours that photos tell of, [3]."""
+        return self.told_color.log().mean(dim=0)
+
+    @property
+    def lighting(self) -> Globals:
+        """The shared parameters, with how bright the tissue is that light bounces off."""
+        return replace(self.shared, tissue=self.mean_log_color) if self.shared.bounces else self.shared
+
+    @cached_property
     def link_slope(self) -> Tensor:
         """d materials / dθ, [V, 4]. Base colour keeps its slope at the clamp, so that it can come back."""
         raw, gamma = self.raw, self.shared.gamma
@@ -108,10 +117,14 @@ def without_furnace(state: State) -> State:
     return state if state.shared.log_scale <= limit else rescaled(state, limit)
 
 
-def room_below_furnace(state: State, step: float) -> float:
-    """The share of a ``step`` of the albedo's log scale, at most 1, after which the tissue is no furnace."""
-    room = math.log(ALBEDO_MAX / brightest(state)) - state.shared.log_scale
-    return 1.0 if step <= room else max(room, 0.0) / step
+def at_furnace(state: State, rise: np.ndarray) -> int | None:
+    """The channel, if any, whose brightest tissue would be a furnace after half of a step by which ln of each
+    channel's albedo ``rise``s, [3]."""
+    if not len(rise):
+        return None
+    color = np.percentile(state.told_color.cpu().numpy(), 98, axis=0)
+    beyond = np.log(color / ALBEDO_MAX) + state.shared.log_scale + rise / 2
+    return int(beyond.argmax()) if beyond.max() > 0 and rise[beyond.argmax()] > 0 else None
 
 
 def brightest(state: State) -> float:
@@ -119,33 +132,11 @@ def brightest(state: State) -> float:
     return float(np.percentile(state.told_color.amax(dim=1).cpu().numpy(), 98))
 
 
-def as_bouncing(state: State, before: State) -> State:
-    """``state`` with the albedo's scale such that light bounces as a step from ``before`` has found it.
-
-    A step takes the bounce for that of the old base colours, seen through the new response and scaled: what
-    the colours have gained since would bounce on top, and scale and colours would swing against each other
-    from step to step.
-    """
-    old = replace(before, shared=state.shared).told_color
-    gained = (state.told_color.mean(dim=0) / old.mean(dim=0)).log().mean()
-    return rescaled(state, state.shared.log_scale - float(gained))
-
-
 def halfway(state: State, other: State) -> State:
     """The state between two of one operator and mean."""
     vector = (state.shared.vector + other.shared.vector) / 2
     shared = replace(other.shared, vector=vector)
     return replace(other, table=(state.table + other.table) / 2, shared=shared)
-
-
-def mixed(mixing: Mixing, state: State, moved: State) -> State:
-    """``moved``, to which a step has led from ``state``, as those before it say that it should go on."""
-    point, image = (
-        np.r_[each.table.flatten().double().numpy(), each.shared.log_scale] for each in (state, moved)
-    )
-    found = mixing.mixed(point, image)
-    table = torch.from_numpy(found[:-1]).float().reshape(moved.table.shape)
-    return rescaled(replace(moved, table=table), float(found[-1]))
 
 
 def rescaled(state: State, log_scale: float) -> State:

@@ -100,6 +100,7 @@ class Bounce(Rows):
             nobody asked for it.
         surroundings: float32 [N, 3], radiosity of that over E; None: 1.
         shown: float32 [N, 3], γ·ln of the points' base colours that throw it; None: it follows no colours.
+        tissue: float32 [N, 3], γ times the mean of ln of all tissue's, alike in all rows.
     """
 
     log: Tensor
@@ -110,6 +111,7 @@ class Bounce(Rows):
     gloss: Tensor | None = None
     surroundings: Tensor | None = None
     shown: Tensor | None = None
+    tissue: Tensor | None = None
 
     def to(self, device: torch.device) -> Bounce:
         """The same on ``device``."""
@@ -132,9 +134,12 @@ class Bounce(Rows):
         """d ln E / d ln base colour of the points, [N, 3], as far as the tissue about them changes alike."""
         return ALIKE * self.by_scale
 
-    def followed(self, log_color: Tensor, gamma: float) -> Tensor:
-        """Factor [N, 3] on it with base colours of logarithm ``log_color`` [N, 3]."""
+    def followed(self, log_color: Tensor, gamma: float, tissue: Tensor | None = None) -> Tensor:
+        """Factor [N, 3] on it with base colours of logarithm ``log_color`` [N, 3], where the mean of all
+        tissue's is ``tissue`` [3] (None: what it was)."""
         log_factor = self.following * (log_color - self.shown / gamma)
+        if tissue is not None and self.tissue is not None:
+            log_factor = log_factor + (1 - ALIKE) * self.by_scale * (tissue - self.tissue / gamma)
         return torch.exp(log_factor.clamp(-MOST_FOLLOWED, MOST_FOLLOWED))
 
 
@@ -190,7 +195,7 @@ class BouncedLight:
     def _mirrors(self) -> list[scipy.sparse.csr_array]:
         """What each view's light throws on where white lobes mirror it."""
         views = zip(self._sources_mm, self._lamps, strict=True)
-        return [self._radiosity.mirror_factors(source_mm, lamps) for source_mm, lamps in views]
+        return list(on_all_cores(lambda view: self._radiosity.mirror_factors(*view), views))
 
     @cached_property
     def _shown(self) -> list[scipy.sparse.csr_array]:

@@ -152,10 +152,6 @@ class Samples:
         level = torch.from_numpy(np.rint(255 * tone.undone(levels)).astype(np.uint8))
         return replace(self, color=level[self.color.long()])
 
-    def under_still_bounce(self) -> Samples:
-        """The same samples under bounced light that follows no colours."""
-        return replace(self, bounce=replace(self.bounce, shown=None))
-
     def thinned(self, count: int, generator: np.random.Generator) -> Samples:
         """About ``count`` of the samples, drawn evenly at random; all of them if there are no more."""
         if len(self) <= count:
