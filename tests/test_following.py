@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from endotwin.fit.following import SHARE, Following
+from endotwin.fit.following import Following
+from endotwin.light.bounced import WITH_ALL
 
 ENTRIES, PIXELS = 7, 40
 
@@ -26,7 +27,7 @@ def test_products_and_pulls_are_those_of_slopes_that_know_what_every_entry_does_
         random.normal(size=PIXELS),
         random.normal(size=(7, 3)),
     )
-    turn = SHARE * np.eye(3) - (0 if kept is None else np.outer(np.ones(3), np.eye(3)[kept]))
+    turn = WITH_ALL * np.eye(3) - (0 if kept is None else np.outer(np.ones(3), np.eye(3)[kept]))
     whole = slopes + by_light @ turn @ full(along).T
     weighted = by_light.T * weight
     border = (weighted @ slopes).T.reshape(ENTRIES, 4, 3)
@@ -55,4 +56,4 @@ def test_a_scale_that_makes_up_for_a_channel_leaves_its_light_to_what_is_about_e
     following = Following(along, turn, *nothing)
     whiter = following.whiter(torch.from_numpy(random.normal(size=(ENTRIES, 4, 1))))
     lit = (turn @ whiter)[:, 0] + whiter[kept]
-    torch.testing.assert_close(lit, SHARE * whiter[:, 0])
+    torch.testing.assert_close(lit, WITH_ALL * whiter[:, 0])

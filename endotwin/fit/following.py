@@ -12,10 +12,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from endotwin.light.bounced import ALIKE
-
-SHARE = 1 - ALIKE
-"""Of it, that light follows all tissue by; what is left is for that about each place."""
+from endotwin.light.bounced import WITH_ALL
 
 
 @dataclass(frozen=True)
@@ -36,7 +33,7 @@ class Following:
     def turning(kept: int | None) -> Tensor:
         """u by the changes of each channel's mean; where the albedo of the channel ``kept`` is to stay what
         it is, by a scale of all."""
-        turn = SHARE * torch.eye(3)
+        turn = WITH_ALL * torch.eye(3)
         if kept is not None:
             turn[:, kept] -= 1
         return turn

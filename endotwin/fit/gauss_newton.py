@@ -21,12 +21,13 @@ import scipy.linalg
 import torch
 from torch import Tensor
 
-from endotwin.fit.following import SHARE, Following
+from endotwin.fit.following import Following
 from endotwin.fit.frame_gains import FramePattern
 from endotwin.fit.hashgrid import HashOperator
 from endotwin.fit.model import GLOBALS, Globals, at_pixels, columns_of, predict
 from endotwin.fit.normal_equations import CHANNELS, MeshPattern, NormalEquations, assemble, robust_cost
 from endotwin.fit.state import GLOBAL_RANGE, ROUGHNESS_RANGE, State, at_furnace, bounded, without_furnace
+from endotwin.light.bounced import WITH_ALL
 from endotwin.light.shading import F0_DIELECTRIC
 from endotwin.pixels.samples import Samples, drawn
 from endotwin.pixels.start import LIGHT_MEAN, LIGHT_SPREAD, PRIOR
@@ -230,7 +231,7 @@ class GaussNewton:
         if gains:
             columns = columns_of(state.shared, joint) @ shared_step.numpy()
             if len(rise):
-                columns[-3:] += SHARE * (rise - columns[-3:])
+                columns[-3:] += WITH_ALL * (rise - columns[-3:])
             gain_step = equations.gains.step(state.link_slope * self._operator(table_step), columns)
             trusted = min(trusted, MOST_GAIN_STEP / max(float(np.abs(gain_step).max()), 1e-12))
         before = self._cost(state, noise)

@@ -376,13 +376,13 @@ class LightStage:
         within, material = self._within()
         self._take(within.shone(material, shared, noise))
         self._relighting(self._solver, self._state)
-        if before.shared.coat is not None or self._wanted["coat"] == "on":
-            if before.shared.coat is not None and self._solver.cost(self._state, noise) > WORSE * bare.cost:
+        if before.shared.coat is not None:
+            if self._solver.cost(self._state, noise) > WORSE * bare.cost:
                 self._take_best(bare)
-            return
-        self._bare = bare
-        if self._state.shared.coat.weight == 0:
-            self._leave_coat("all pixels give it no weight")
+        elif self._wanted["coat"] != "on":
+            self._bare = bare
+            if self._state.shared.coat.weight == 0:
+                self._leave_coat("all pixels give it no weight")
 
     def _leave_worse_coat(self) -> None:
         """End the trial of a new coat, and leave it off if all pixels are plainly worse than before it."""

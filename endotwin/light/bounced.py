@@ -30,6 +30,9 @@ ALIKE = 0.5
 """Light follows a change of all colours in full, and that of a single place not at all. Taken for halfway,
 both settle from step to step: of an error, no more than s/2 / (1 + s/2) is left where s = share·by_scale."""
 
+WITH_ALL = 1 - ALIKE
+"""What is left of a change that light follows in full is for the mean colour of all tissue."""
+
 MOST_FOLLOWED = 1.0
 """Of the logarithm of bounced light, that it follows the colours at once."""
 
@@ -139,7 +142,7 @@ class Bounce(Rows):
         tissue's is ``tissue`` [3] (None: what it was)."""
         log_factor = self.following * (log_color - self.shown / gamma)
         if tissue is not None and self.tissue is not None:
-            log_factor = log_factor + (1 - ALIKE) * self.by_scale * (tissue - self.tissue / gamma)
+            log_factor = log_factor + WITH_ALL * self.by_scale * (tissue - self.tissue / gamma)
         return torch.exp(log_factor.clamp(-MOST_FOLLOWED, MOST_FOLLOWED))
 
 
