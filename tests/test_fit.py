@@ -17,8 +17,8 @@ from endotwin.config import FitConfig
 from endotwin.effects.tone import Tone
 from endotwin.evaluation.evaluation import covered_pixels
 from endotwin.fit import fit
-from endotwin.fit.light_stage import proxies
 from endotwin.fit.solve import median_edge_mm
+from endotwin.fit.steps import proxies
 from endotwin.pixels.pace import Pace
 from endotwin.pixels.samples import gather
 from endotwin.surface.casting import Caster

@@ -9,6 +9,7 @@ import torch
 import tube_twin
 
 from endotwin.effects import Effects
+from endotwin.effects.coat import Coat
 from endotwin.effects.interreflection import Interreflection
 from endotwin.effects.specular import Specular
 from endotwin.fit.gauss_newton import FIRST_ERROR, PASSING, STANDARD_SPREAD, TEMPER, GaussNewton, unusual
@@ -17,6 +18,7 @@ from endotwin.fit.state import (
     DARKEST,
     GLOBAL_RANGE,
     State,
+    as_bright,
     at_furnace,
     brightest,
     rescaled,
@@ -74,6 +76,20 @@ def test_tissue_without_a_furnace_reflects_at_most_what_tissue_may():
     for log_scale in (-1.0, 0.1, 2.0):
         moved = without_furnace(colored(0.8, log_scale))
         assert brightest(moved) * math.exp(moved.shared.log_scale) <= ALBEDO_MAX * (1 + 1e-6)
+
+
+@pytest.mark.parametrize("weight", [0.2, 1.0])
+def test_tissue_under_a_coat_throws_as_much_of_the_light_that_bounces_longest_as_it_did_bare(weight):
+    def gained(state: State) -> torch.Tensor:
+        """1/(1 − ρ), by which an integrating sphere of the mean tissue brightens its own light, [3]."""
+        white = state.shared.lobes.glossy_albedo(state.materials[:, 3]).mean()
+        return 1 / (1 - math.exp(state.shared.log_scale) * (state.mean_log_color.exp() + white))
+
+    bare = colored(0.8, 0.4)
+    coated = replace(bare, shared=replace(bare.shared, coat=Coat(weight, 0.15)))
+    kept = gained(as_bright(coated, bare))
+    assert kept[0] == pytest.approx(float(gained(bare)[0]), rel=1e-5) and gained(coated)[0] > 1.01 * kept[0]
+    assert (kept[1:] > gained(bare)[1:]).all()
 
 
 @pytest.mark.parametrize("unseen", [0.5, 20.0])

@@ -6,7 +6,6 @@ depends on the materials, so that both are found in one step.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
@@ -14,43 +13,33 @@ import numpy as np
 import torch
 
 from endotwin.effects import Decision, Effects
+from endotwin.effects.coat import Coat
 from endotwin.effects.tone import Tone
+from endotwin.evidence.coat import Highlights, best_coat
 from endotwin.evidence.coat import judged as judged_coat
 from endotwin.evidence.tone import LEAST_CONTRAST, Hues, steadied
 from endotwin.evidence.tone import judged as judged_tone
-from endotwin.fit.gauss_newton import GaussNewton
-from endotwin.fit.hashgrid import HashGrid, HashOperator
 from endotwin.fit.lighting import Relighting
 from endotwin.fit.model import Globals, at_pixels
+from endotwin.fit.scout import likeliest_n
 from endotwin.fit.state import (
     State,
-    brightest,
-    halfway,
-    rescaled,
-    roughness_to_raw,
+    as_bright,
     too_dark,
-    without_furnace,
 )
+from endotwin.fit.steps import WORSE, solver_of, started, stepped
 from endotwin.fit.within import Renewed, Within
-from endotwin.light.shading import F0_DIELECTRIC, ROUGHNESS_TISSUE
 from endotwin.pixels.length_unit import unit_mm
 from endotwin.pixels.pace import Pace
 from endotwin.pixels.samples import Samples
 from endotwin.pixels.start import Start
 from endotwin.surface import Surface
 
-CELL_MM, COARSEST_MM = 1.6, 12.0
-"""Cells of the features beside which light and response are found, in units of the scene."""
-
-PROXIES = 4
-"""Vertices are merged to so many points a finest cell."""
+CELL_MM = 1.6
+"""Finest cells of the features beside which light and response are found, in units of the scene."""
 
 STEPS, BOUNCE_STEPS = 6, 12
-"""Steps at most, and those where light bounces."""
-
-PALE = 0.75
-"""Brightest channel of the even tissue from which the strength of a bounce is sought: it is found in fewer
-steps from above than from below."""
+"""Steps at most, and those where light bounces, beside those of a new coat's trial."""
 
 HOLD_STEPS = 3
 """In which n and γ stay, and how strongly light bounces is found: steps that find both at once may end beside
@@ -63,13 +52,6 @@ steps; or, where light bounces, after one by which the cost fell by a smaller sh
 BOUNCE_HELD = ("q", "L0")
 """Where light bounces, q stays where the fit starts, at the inverse square of a small light: what the bounce
 off a mesh errs by would bend it, and γ with it. L0 is told by the albedo's scale."""
-
-WORSE, HALVINGS = 1.25, 2
-"""A step under whose light the photos cost so many times what they did is too long, and halved so often; and
-no new coat is kept beside which they cost so many times what they did without."""
-
-COATED_STEPS = 2
-"""In which materials learn to do without what a new coat shows, before all pixels judge it."""
 
 LEAVING = 2
 """Steps in which light learns to do without what is faint, before the materials do."""
@@ -167,26 +149,24 @@ class LightStage:
         tone, decision = (None, None) if before is None else before.toned
         self._decisions: dict[str, Decision] = {} if tone is None else {"tone": decision}
         self._unit_mm = unit_mm(surface)
-        points, group = proxies(surface.vertices_mm, self._unit_mm * CELL_MM / PROXIES)
-        began = pace.stopwatch.total
-        grid = HashGrid(self._unit_mm * COARSEST_MM, self._unit_mm * CELL_MM)
-        operator = HashOperator.of(points, grid)
-        triangles = group[surface.triangles]
-        self._solver = GaussNewton(
-            samples, triangles, operator, self._unit_mm, out_of_time=pace.light_is_over, device=device
-        )
-        set_up = pace.stopwatch.total
         self._goes_on = before is not None and before.state.shared.bounces and relighting.bounces
+        if relighting.bounces and not self._goes_on and not pace.hurried:
+            n = likeliest_n(samples, surface, start, relighting, BOUNCE_HELD)
+            start = replace(start, light=replace(start.light, n=n))
+        began = pace.stopwatch.total
+        options = {"out_of_time": pace.light_is_over, "device": device}
+        self._solver, operator = solver_of(samples, surface, self._unit_mm, CELL_MM, **options)
+        set_up = pace.stopwatch.total
         if self._goes_on:
             shared = replace(before.state.shared, tone=tone)
             self._state = replace(before.state, operator=operator, shared=shared)
         else:
-            self._state = _started(operator, start, relighting, tone, self._solver.pattern.told)
+            self._state = started(operator, start, relighting, self._solver.pattern.told, tone)
         relighting(self._solver, self._state)
         ready = pace.stopwatch.total
         self._state, _ = self._stepped(self._state, joint=False)
         step_s = pace.stopwatch.total - ready
-        weights = len(points) * len(operator.cells_mm)
+        weights = operator.forward_csr.shape[0] * len(operator.cells_mm)
         self.cost = Cost(set_up - began, step_s, self._solver.solve_s, weights, len(samples))
 
     def found(self) -> FoundLight:
@@ -223,7 +203,7 @@ class LightStage:
         """Light and materials in one step, for the strength of the bounce. Ends early where photos show no
         bounce. Coat and tone are judged beside a response that is held near that of displays, for which they
         could pass; then photos are believed as far as the model explains them."""
-        number, near, trial, best = 0, self._goes_on and self._pace.hurried, COATED_STEPS, None
+        number, near, best = 0, self._goes_on and self._pace.hurried, None
         while number < BOUNCE_STEPS and not self._late:
             if near and (toned := self._newly_toned()) is not None:
                 return toned
@@ -233,20 +213,23 @@ class LightStage:
             holding = number < HOLD_STEPS and not self._goes_on
             held = ("n", "gamma") if holding else self._undetermined
             self._solver.held = (*held, *BOUNCE_HELD)
-            if shared.coat:
-                self._shine(shared)
-            if near:
-                self._solver.learn_error(self._state)
-            self._state, gain = self._stepped(self._state, joint=True)
+            trying = self._bare is not None
+            gain = self._step_coated(shared) if shared.coat else self._step()
+            if self._bare is not None and not trying:
+                number = min(number, BOUNCE_STEPS - LATEST)
             if too_dark(self._state) and self._bare is not None:
                 self._leave_coat("beside it no light would bounce")
             elif too_dark(self._state):
                 self._state = self._relighting.without_bounce(self._solver, self._state)
                 return None
-            if self._bare is not None and (trial := trial - 1) == 0:
+            tried = self._bare is not None and self._changed_by_less(gain, NEAR)
+            if tried:
                 self._leave_worse_coat()
             if near and self._bare is None:
+                self._solver.learn_error(self._state)
                 best = self._better(best)
+            if tried:
+                self._choose_lobe()
             steady = self._changed_by_less(gain, CONVERGED) or _steady(shared, self._state.shared)
             number = self._next(number, BOUNCE_STEPS, number + 1, steady and not holding)
             near = near or number >= LATEST or (self._changed_by_less(gain, NEAR) and not holding)
@@ -357,32 +340,52 @@ class LightStage:
         return within.hues(material, self._state.shared, self._noise)
 
     def _coated(self) -> Globals:
-        """Light and response with the coat that highlights call for, clipped ones included."""
+        """Light and response with the coat that highlights call for."""
+        layer, self._decisions["coat"] = judged_coat(self._highlights(), self._wanted["coat"])
+        return replace(self._state.shared, coat=layer)
+
+    def _choose_lobe(self) -> None:
+        """Take the lobe that highlights call for beside what was found with the one that was chosen without a
+        coat, if there is one."""
+        if self._state.shared.coat is not None:
+            coat, _ = best_coat(self._highlights())
+            self._state = replace(self._state, shared=replace(self._state.shared, coat=coat))
+
+    def _highlights(self) -> Callable[[Coat], Highlights]:
+        """Highlights, by the coat over them, clipped ones included."""
         solver, state, relighting = self._solver, self._state, self._relighting
         under = relighting.relit(relighting.lit(self._clipped), solver.triangles, state)
         shiny = Samples.joined([solver.samples, under], solver.samples.views)
         material = at_pixels(shiny, solver.triangles, state.materials)
         seen = Within.of(shiny, self._surface, self._unit_mm)
-        highlights = seen.highlights(material, state.shared, self._noise)
-        layer, self._decisions["coat"] = judged_coat(highlights, self._wanted["coat"])
-        return replace(state.shared, coat=layer)
+        return seen.highlights(material, state.shared, self._noise)
 
-    def _shine(self, shared: Globals) -> None:
-        """Take ``shared`` with the f0, coat and roughness that all pixels ask for, if beside the light that
-        then bounces they say so, too; a coat that is new, which highlights alone have found, for a trial,
-        unless they give it no weight."""
-        before, noise = self._state, self._noise
-        bare = Best(before, self._relighting.effects, self._solver.cost(before, noise), noise)
+    def _step(self) -> float:
+        """A step of all; by how much the cost fell."""
+        self._state, fell = self._stepped(self._state, joint=True)
+        return fell
+
+    def _step_coated(self, shared: Globals) -> float:
+        """A step of all from ``shared`` with the f0, coat and roughness that all pixels ask for, unless they
+        are plainly worse after it; by how much the cost fell in all. A new coat, which highlights alone have
+        found, is on trial, until its steps have come near what they go to."""
+        noise = self._noise
+        before = Best(self._state, self._relighting.effects, self._solver.cost(self._state, noise), noise)
+        if before.state.shared.coat is None and self._wanted["coat"] != "on":
+            self._bare = before
         within, material = self._within()
         self._take(within.shone(material, shared, noise))
+        if self._bare is before and self._state.shared.coat.weight == 0:
+            self._leave_coat("all pixels give it no weight")
+            return self._step()
+        self._state = as_bright(self._state, before.state)
         self._relighting(self._solver, self._state)
-        if before.shared.coat is not None:
-            if self._solver.cost(self._state, noise) > WORSE * bare.cost:
-                self._take_best(bare)
-        elif self._wanted["coat"] != "on":
-            self._bare = bare
-            if self._state.shared.coat.weight == 0:
-                self._leave_coat("all pixels give it no weight")
+        self._step()
+        after = self._solver.cost(self._state, noise)
+        if after > WORSE * before.cost and before.state.shared.coat is not None:
+            self._take_best(before)
+            return self._step()
+        return before.cost - after
 
     def _leave_worse_coat(self) -> None:
         """End the trial of a new coat, and leave it off if all pixels are plainly worse than before it."""
@@ -405,31 +408,7 @@ class LightStage:
         return Best(self._state, self._relighting.effects, cost, noise)
 
     def _stepped(self, state: State, joint: bool) -> tuple[State, float]:
-        """A step, of the materials alone where a ``joint`` one finds nothing lower, with the samples relit by
-        what it has found; and by how much the cost fell (below 0: it rose).
-
-        A step knows what it does to bounced light to first order. Where that was too far, it goes half the
-        way.
-        """
-        solver, relighting = self._solver, self._relighting
-        found = solver.step(state, joint, gains=joint and "gain" in relighting.effects)
-        if joint and not found.fell:
-            found = solver.step(state, joint=False)
-        relighting.brighten(solver, found.log_gain)
-        moved = found.state
-        if not relighting.bounces:
-            relighting(solver, moved)
-            return moved, found.fell
-        noise = solver.noise(state)
-        before = solver.cost(state, noise)
-        for halving in range(HALVINGS + 1):
-            moved = without_furnace(moved)
-            relighting(solver, moved)
-            after = solver.cost(moved, noise)
-            if after <= WORSE * before or halving == HALVINGS:
-                break
-            moved = halfway(state, moved)
-        return moved, before - after
+        return stepped(self._solver, self._relighting, state, joint)
 
 
 def _steady(before: Globals, after: Globals) -> bool:
@@ -439,26 +418,3 @@ def _steady(before: Globals, after: Globals) -> bool:
         for each in (before, after)
     )
     return bool((abs(now - was) < STEADY * np.maximum(was, STEADY)).all())
-
-
-def _started(
-    operator: HashOperator, start: Start, relighting: Relighting, tone: Tone | None, told: torch.Tensor
-) -> State:
-    """Even tissue under the light of ``start``, for photos that tell of the vertices ``told``, bool [V]."""
-    shown = torch.from_numpy(start.base_color) ** start.response.gamma
-    mean = torch.cat([shown.median(dim=0).values, torch.tensor([roughness_to_raw(ROUGHNESS_TISSUE)])])
-    options = {"specular": "specular" in relighting.effects, "bounce": relighting.bounces}
-    shared = replace(Globals.of(start.light, start.response, F0_DIELECTRIC, **options), tone=tone)
-    state = State(operator, mean, torch.zeros(operator.forward_csr.shape[1], 4), shared, told)
-    return rescaled(state, math.log(PALE / brightest(state))) if relighting.bounces else state
-
-
-def proxies(vertices_mm: np.ndarray, cell_mm: float) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices [V, 3] merged by cells of edge ``cell_mm``: mean points float32 [P, 3], and the point of each
-    vertex [V].
-    """
-    cells = np.floor(vertices_mm / cell_mm).astype(np.int64)
-    _, group, count = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
-    group = group.reshape(-1)
-    sums = [np.bincount(group, vertices_mm[:, axis]) for axis in range(3)]
-    return (np.stack(sums, axis=1) / count[:, None]).astype(np.float32), group

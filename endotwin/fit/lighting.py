@@ -19,13 +19,16 @@ from endotwin.fit.model import Globals, at_pixels, slope_by_log_exposure
 from endotwin.fit.normal_equations import CHUNK, Residual
 from endotwin.fit.state import State
 from endotwin.fit.within import Renewed, Varied
-from endotwin.light.bounced import BOUNCES_BY, GAMMA_STEP, Albedo, BouncedLight, Places
+from endotwin.light.bounced import GAMMA_STEP, Albedo, BouncedLight, Places
 from endotwin.light.guides import AT_LENS, COSINE, Guided, guided, log_axis, visible_in_views
 from endotwin.light.radiosity import Radiosity
 from endotwin.pixels.samples import Samples, Views
 from endotwin.run.ahead import on_all_cores
 from endotwin.surface import Surface
 from endotwin.surface.casting import Caster
+
+MOVING = ("n", "scale")
+"""What a fit changes of the light that bounces: q stays."""
 
 
 def lit(samples: Samples, surface: Surface, caster: Caster, effects: Effects) -> Samples:
@@ -129,7 +132,7 @@ class Relighting:
         if found.faint.any():
             self.faint = self.faint.with_more(found.faint)
         if len(found.log_gain) or found.faint.any():
-            samples = self._exposed(samples)
+            samples = self.exposed(samples)
         if len(found.aside_mm):
             guides_mm = np.asarray(self.effects.guides_mm) + found.aside_mm
             guides_mm[:, 2] = np.minimum(guides_mm[:, 2], 0)
@@ -142,15 +145,15 @@ class Relighting:
         """Frames brighter by ``log_gain`` [F], or as they are by [0], and the samples of ``solver`` so."""
         if len(log_gain):
             self.effects = _brightened(self.effects, log_gain)
-            solver.relight(self._exposed(solver.samples))
+            solver.relight(self.exposed(solver.samples))
 
     def expose(self, solver: GaussNewton, effects: Effects) -> None:
         """The samples of ``solver`` with the gain and vignetting of ``effects``, which hold from here on, and
         nothing faint."""
         self.effects, self.faint = effects, NOTHING
-        solver.relight(self._exposed(solver.samples))
+        solver.relight(self.exposed(solver.samples))
 
-    def _exposed(self, samples: Samples) -> Samples:
+    def exposed(self, samples: Samples) -> Samples:
         """``samples`` with the effects' gain and vignetting, and what is faint."""
         samples = exposed(samples, self.effects)
         if not self.faint.found:
@@ -189,7 +192,7 @@ class Relighting:
     def relit(self, samples: Samples, triangles: Tensor, state: State) -> Samples:
         """``bounced``, and with the gain and what is faint as they were found last."""
         samples = self.bounced(samples, triangles, state)
-        return self._exposed(samples) if "gain" in self.effects or self.faint.found else samples
+        return self.exposed(samples) if "gain" in self.effects or self.faint.found else samples
 
     def __call__(self, solver: GaussNewton, state: State) -> None:
         """Relight the samples of ``solver`` as ``state`` says."""
@@ -199,7 +202,7 @@ class Relighting:
             width = HUBER * solver.noise(state)
             material = at_pixels(samples, solver.triangles, state.materials)
             self.effects = regained(samples, material, state.shared, self.effects, width)
-            samples = self._exposed(samples)
+            samples = self.exposed(samples)
         if self.needed:
             solver.relight(samples)
 
@@ -234,7 +237,7 @@ class Bouncer:
         by, seen_by = ("scale",), None
         if not self.light_stays:
             steeper = base_color ** (shared.gamma / (shared.gamma + GAMMA_STEP))
-            by, seen_by = BOUNCES_BY, (shared.gamma, albedo(steeper))
+            by, seen_by = MOVING, (shared.gamma, albedo(steeper))
         bounce = self._light.expanded(places, n, q, albedo(base_color), gloss, scale, seen_by, by)
         shown = shared.gamma * torch.log(at_pixels(samples, triangles, base_color))
         return replace(samples, bounce=replace(bounce, shown=shown))

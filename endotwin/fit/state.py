@@ -74,6 +74,11 @@ class State:
         return self.told_color.log().mean(dim=0)
 
     @property
+    def glossy_albedo(self) -> float:
+        """Mean share of light from all around that white lobes send back, unscaled as base colours are."""
+        return float(self.shared.lobes.glossy_albedo(self.materials[:, 3]).mean())
+
+    @property
     def lighting(self) -> Globals:
         """The shared parameters, with how bright the tissue is that light bounces off."""
         return replace(self.shared, tissue=self.mean_log_color) if self.shared.bounces else self.shared
@@ -130,6 +135,13 @@ def at_furnace(state: State, rise: np.ndarray) -> int | None:
 def brightest(state: State) -> float:
     """98th percentile of the brightest albedo channel, unscaled."""
     return float(np.percentile(state.told_color.amax(dim=1).cpu().numpy(), 98))
+
+
+def as_bright(state: State, other: State) -> State:
+    """``state``, whose white lobes are others than those of the ``other``, with the albedo's scale by which
+    all its lobes send back as much light of the brightest channel: that the bounce has told."""
+    was, now = (float(each.mean_log_color.exp().max()) + each.glossy_albedo for each in (other, state))
+    return rescaled(state, state.shared.log_scale + math.log(was / now))
 
 
 def halfway(state: State, other: State) -> State:
