@@ -22,11 +22,7 @@ from endotwin.evidence.tone import judged as judged_tone
 from endotwin.fit.lighting import Relighting
 from endotwin.fit.model import Globals, at_pixels
 from endotwin.fit.scout import likeliest_n
-from endotwin.fit.state import (
-    State,
-    as_bright,
-    too_dark,
-)
+from endotwin.fit.state import State, as_bright, too_dark
 from endotwin.fit.steps import WORSE, solver_of, started, stepped
 from endotwin.fit.within import Renewed, Within
 from endotwin.pixels.length_unit import unit_mm
@@ -151,7 +147,7 @@ class LightStage:
         self._unit_mm = unit_mm(surface)
         self._goes_on = before is not None and before.state.shared.bounces and relighting.bounces
         if relighting.bounces and not self._goes_on and not pace.hurried:
-            n = likeliest_n(samples, surface, start, relighting, BOUNCE_HELD)
+            n = likeliest_n(samples, surface, start, relighting, BOUNCE_HELD, tone)
             start = replace(start, light=replace(start.light, n=n))
         began = pace.stopwatch.total
         options = {"out_of_time": pace.light_is_over, "device": device}
@@ -213,9 +209,9 @@ class LightStage:
             holding = number < HOLD_STEPS and not self._goes_on
             held = ("n", "gamma") if holding else self._undetermined
             self._solver.held = (*held, *BOUNCE_HELD)
-            trying = self._bare is not None
+            on_trial = self._bare is not None
             gain = self._step_coated(shared) if shared.coat else self._step()
-            if self._bare is not None and not trying:
+            if self._bare is not None and not on_trial:
                 number = min(number, BOUNCE_STEPS - LATEST)
             if too_dark(self._state) and self._bare is not None:
                 self._leave_coat("beside it no light would bounce")

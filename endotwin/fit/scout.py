@@ -15,6 +15,7 @@ import numpy as np
 import torch
 
 from endotwin.effects import Effects
+from endotwin.effects.tone import Tone
 from endotwin.fit.lighting import Relighting
 from endotwin.fit.state import State
 from endotwin.fit.steps import solver_of, started, stepped
@@ -46,10 +47,15 @@ _LEFT = attrgetter("left")
 
 
 def likeliest_n(
-    samples: Samples, surface: Surface, start: Start, relighting: Relighting, held: tuple[str, ...]
+    samples: Samples,
+    surface: Surface,
+    start: Start,
+    relighting: Relighting,
+    held: tuple[str, ...],
+    tone: Tone | None = None,
 ) -> float:
     """The n beside which the light of ``start``, whose parameters ``held`` stay, leaves least of the
-    ``samples`` unexplained."""
+    ``samples`` unexplained, as they look through the ``tone`` curve."""
     few, effects, unit = _of_some_vertices(samples, surface), relighting.effects, unit_mm(surface)
     solver, operator = solver_of(few, surface, unit, CELL_MM)
     solver.held = ("n", "gamma", *held)
@@ -67,7 +73,7 @@ def likeliest_n(
     paths = []
     for sigma in SIGMAS:
         light = replace(start.light, n=PRIOR["n"] + sigma * LIGHT_SPREAD[0] / PRIOR["gamma"])
-        state = started(operator, replace(start, light=light), relighting, solver.pattern.told)
+        state = started(operator, replace(start, light=light), relighting, solver.pattern.told, tone)
         paths.append(gone_on(_Path(state, effects, math.inf), joint=False))
     paths = [gone_on(path, joint=True) for path in sorted(paths, key=_LEFT)[:KEPT]]
     relighting.effects = effects
