@@ -70,6 +70,7 @@ def likeliest_n(
             state, _ = stepped(solver, relighting, state, together)
         return _Path(state, relighting.effects, solver.noise(state))
 
+    relighting.keep_light()
     paths = []
     for sigma in SIGMAS:
         light = replace(start.light, n=PRIOR["n"] + sigma * LIGHT_SPREAD[0] / PRIOR["gamma"])
@@ -77,6 +78,7 @@ def likeliest_n(
         paths.append(gone_on(_Path(state, effects, math.inf), joint=False))
     paths = [gone_on(path, joint=True) for path in sorted(paths, key=_LEFT)[:KEPT]]
     relighting.effects = effects
+    relighting.keep_light(False)
     return min(paths, key=_LEFT).state.shared.light.n
 
 
