@@ -160,7 +160,7 @@ class LightStage:
             self._state = started(operator, start, relighting, self._solver.pattern.told, tone)
         relighting(self._solver, self._state)
         ready = pace.stopwatch.total
-        self._state, _ = self._stepped(self._state, joint=False)
+        self._step(joint=False)
         step_s = pace.stopwatch.total - ready
         weights = operator.forward_csr.shape[0] * len(operator.cells_mm)
         self.cost = Cost(set_up - began, step_s, self._solver.solve_s, weights, len(samples))
@@ -190,7 +190,7 @@ class LightStage:
             self._renew(shared, self._undetermined, self._noise)
             if late:
                 break
-            self._state, gain = self._stepped(self._state, joint=False)
+            gain = self._step(joint=False)
             number = self._next(number, STEPS, COAT_STEP, self._changed_by_less(gain, CONVERGED))
         self._without_faint()
         return None
@@ -210,7 +210,7 @@ class LightStage:
             held = ("n", "gamma") if holding else self._undetermined
             self._solver.held = (*held, *BOUNCE_HELD)
             on_trial = self._bare is not None
-            gain = self._step_coated(shared) if shared.coat else self._step()
+            gain = self._step_coated(shared) if shared.coat else self._step(joint=True)
             if self._bare is not None and not on_trial:
                 number = min(number, BOUNCE_STEPS - LATEST)
             if too_dark(self._state) and self._bare is not None:
@@ -252,7 +252,7 @@ class LightStage:
                 return
             self._renew(self._state.shared, held, self._noise)
         if not self._late:
-            self._state, _ = self._stepped(self._state, joint=False)
+            self._step(joint=False)
 
     def _renew(self, shared: Globals, held: tuple[str, ...], noise: float) -> None:
         """Light and response, from ``shared``, and what may vary with them, by what varies within vertices.
@@ -356,31 +356,30 @@ class LightStage:
         seen = Within.of(shiny, self._surface, self._unit_mm)
         return seen.highlights(material, state.shared, self._noise)
 
-    def _step(self) -> float:
-        """A step of all; by how much the cost fell."""
-        self._state, fell = self._stepped(self._state, joint=True)
+    def _step(self, joint: bool) -> float:
+        """A step, of the materials alone unless it is ``joint``; by how much the cost fell."""
+        self._state, fell = stepped(self._solver, self._relighting, self._state, joint)
         return fell
 
     def _step_coated(self, shared: Globals) -> float:
         """A step of all from ``shared`` with the f0, coat and roughness that all pixels ask for, unless they
         are plainly worse after it; by how much the cost fell in all. A new coat, which highlights alone have
         found, is on trial, until its steps have come near what they go to."""
-        noise = self._noise
-        before = Best(self._state, self._relighting.effects, self._solver.cost(self._state, noise), noise)
+        before = self._better(None)
         if before.state.shared.coat is None and self._wanted["coat"] != "on":
             self._bare = before
         within, material = self._within()
-        self._take(within.shone(material, shared, noise))
+        self._take(within.shone(material, shared, before.noise))
         if self._bare is before and self._state.shared.coat.weight == 0:
             self._leave_coat("all pixels give it no weight")
-            return self._step()
+            return self._step(joint=True)
         self._state = as_bright(self._state, before.state)
         self._relighting(self._solver, self._state)
-        self._step()
-        after = self._solver.cost(self._state, noise)
+        self._step(joint=True)
+        after = self._solver.cost(self._state, before.noise)
         if after > WORSE * before.cost and before.state.shared.coat is not None:
             self._take_best(before)
-            return self._step()
+            return self._step(joint=True)
         return before.cost - after
 
     def _leave_worse_coat(self) -> None:
@@ -402,9 +401,6 @@ class LightStage:
         if best is not None and best.cost <= cost:
             return best
         return Best(self._state, self._relighting.effects, cost, noise)
-
-    def _stepped(self, state: State, joint: bool) -> tuple[State, float]:
-        return stepped(self._solver, self._relighting, state, joint)
 
 
 def _steady(before: Globals, after: Globals) -> bool:

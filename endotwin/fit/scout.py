@@ -56,7 +56,7 @@ def likeliest_n(
 ) -> float:
     """The n beside which the light of ``start``, whose parameters ``held`` stay, leaves least of the
     ``samples`` unexplained, as they look through the ``tone`` curve."""
-    few, effects, unit = _of_some_vertices(samples, surface), relighting.effects, unit_mm(surface)
+    few, effects, unit = _few_of(samples, surface), relighting.effects, unit_mm(surface)
     solver, operator = solver_of(few, surface, unit, CELL_MM)
     solver.held = ("n", "gamma", *held)
 
@@ -82,7 +82,7 @@ def likeliest_n(
     return min(paths, key=_LEFT).state.shared.light.n
 
 
-def _of_some_vertices(samples: Samples, surface: Surface) -> Samples:
+def _few_of(samples: Samples, surface: Surface) -> Samples:
     vertex = samples.nearest(surface.triangles)
     rows = whole_groups(vertex, len(surface.vertices_mm), PIXELS, np.random.default_rng(0))
     return samples[torch.from_numpy(rows)]
