@@ -55,11 +55,14 @@ class Highlights:
         return Design(np.c_[self.by_tissue, self.by_coat], vertex, int(vertex.max()) + 1)
 
 
-def judged(under: Callable[[Coat], Highlights], wanted: str) -> tuple[Coat | None, Decision]:
+def judged(
+    under: Callable[[Coat], Highlights], wanted: str, tried: bool = False
+) -> tuple[Coat | None, Decision]:
     """The coat that the highlights call for, or that is ``wanted`` (auto, on or off); and why.
 
     Args:
-        under: the highlights, by the coat whose weight is sought.
+        under: the highlights, by the coat whose weight is sought. tried: a hint is enough, since all pixels
+            are asked before it is kept.
     """
     if wanted == "off":
         return None, Decision("off", "forced off")
@@ -67,7 +70,8 @@ def judged(under: Callable[[Coat], Highlights], wanted: str) -> tuple[Coat | Non
     coat, verdict = best_coat(under)
     took_s = round(time.perf_counter() - began, 3)
     forced = "forced on; " if wanted == "on" else ""
-    if wanted == "auto" and not verdict.keep:
+    enough = verdict.hints if tried else verdict.keep
+    if wanted == "auto" and not enough:
         reason = f"does not predict held-out highlights better ({verdict})"
         return None, Decision("off", reason, round(verdict.gain_db, 3), took_s)
     reason = f"{forced}predicts held-out highlights better by {verdict}"

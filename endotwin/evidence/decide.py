@@ -28,7 +28,16 @@ from endotwin.effects.specular import Specular
 from endotwin.effects.vignetting import Vignetting
 from endotwin.evidence.bounce import Surroundings, cell_mm
 from endotwin.evidence.glints import Glints
-from endotwin.evidence.guide_search import Ground, Guides, Search, found_guides, polished, settled
+from endotwin.evidence.guide_search import (
+    BARE,
+    Ground,
+    Guides,
+    Search,
+    found_guides,
+    polished,
+    settled,
+    worth,
+)
 from endotwin.evidence.log_light import Bounced
 from endotwin.evidence.probe import (
     MIN_GAIN_DB,
@@ -133,6 +142,8 @@ class _Trial:
             self._seek_guides(best)
             self._seconds["offset"] += time.perf_counter() - began
         sets = self._sets(TOGETHER) if self._beside_lens else lens
+        if self._beside_lens and self._told_by_glints:
+            sets = [names for names in sets if "offset" in names]
         kept, verdicts = self._pruned(self._best(sets))
         for name in TOGETHER:
             self._say(name, name in kept, verdicts.get(name) or self._beside_kept(name, kept))
@@ -171,6 +182,10 @@ class _Trial:
     @property
     def _beside_lens(self) -> bool:
         return self._guides_mm[False] != AT_LENS
+
+    @property
+    def _told_by_glints(self) -> bool:
+        return any(self._ground.glints.tell(guides_mm) for guides_mm in self._guides_mm.values())
 
     def shadowed(self, kept: Fitted) -> Fitted:
         """``kept``, whose guides cast shadows, or the same without them where too few pixels lie in one, or
@@ -298,6 +313,9 @@ class _Trial:
             names = names - {min(unworthy, key=lambda name: verdicts[name].gain_db)}
 
     def _worth_within(self, names: frozenset[str], name: str, verdict: Verdict) -> bool:
+        if name == "offset":
+            model = self._model(names)
+            return worth(verdict, model.hypothesis) or self._ground.told(model, verdict)
         told = name != "gain" or "interreflection" not in names or verdict.gain_db >= PLAIN_DB
         told = told or float(self._model(names).log_gain.std()) >= LEAST_GAIN
         return told and _worth(name, verdict)
@@ -338,7 +356,11 @@ class _Trial:
         elif on:
             forced = "forced on; " if self.wanted(name) == "on" else ""
             reason = f"{forced}predicts held-out pixels better by {verdict}"
-            if not forced and verdict.gain_db < 0:
+            if not forced and name == "offset" and verdict.gain_db < BARE.gain_db:
+                reason = (
+                    f"glints stand about guides, and no held-out pixels plainly contradict it ({verdict})"
+                )
+            elif not forced and verdict.gain_db < 0:
                 reason = f"certain beside guides, and no held-out pixels plainly contradict it ({verdict})"
         elif verdict is not None:
             reason = f"does not predict held-out pixels better ({verdict})"

@@ -34,6 +34,9 @@ REACH = 0.36
 """Crossings are mapped so far about the lens, as a share of the median viewing distance."""
 
 CELLS = 64
+EXPOSED = 2
+"""Rounds in which medians of places and of photos are found beside each other."""
+
 STEEPEST = 0.1
 """Mirrored rays that run nearer to the plane of the lens cross it anywhere."""
 
@@ -45,6 +48,12 @@ LEAST_SEEN = 1e-3
 """The share of pixels in the fullest cell below which one says nothing."""
 
 LEAST_RATE = 1e-6
+
+MOST_GUIDES = 3
+
+PLAIN, LEAST_GLINTS = 4.0, 100
+"""Guides that leave so many times less of so many glints than light at the lens does are told by them. Normals
+that err alike in many places pass for guides, too, but explain half at most."""
 
 
 class Glints:
@@ -89,6 +98,19 @@ class Glints:
         share = min(1.0, pixels / self.seen.sum())
         return np.sqrt(share) * self._residuals(np.asarray(guides_mm)[:, :2], spread_mm, rates)
 
+    def told(self) -> int:
+        """The least number of guides that glints plainly tell of; 0: of none."""
+        numbers = range(1, MOST_GUIDES + 1)
+        return next((number for number in numbers if self.tell(self.guides_mm(number))), 0)
+
+    def tell(self, guides_mm: np.ndarray) -> bool:
+        """Whether glints plainly stand about guides at ``guides_mm`` [K, 3], and not about the lens."""
+        if self.shone.sum() < LEAST_GLINTS:
+            return False
+        about_lens = self._residuals(*self._best(0))
+        about_guides = self._residuals(np.asarray(guides_mm)[:, :2], *self._best(len(guides_mm))[1:])
+        return float((about_lens**2).sum()) > PLAIN * float((about_guides**2).sum())
+
     def _residuals(self, guides_mm: np.ndarray, spread_mm: float, rates: np.ndarray) -> np.ndarray:
         """Deviance residuals [C²] of Poisson numbers of glints with one rate anywhere and more about each
         guide [K, 2], both in ``rates``: half their squares are negative log-likelihoods."""
@@ -99,13 +121,14 @@ class Glints:
         return (np.sign(self.shone - mean) * np.sqrt(2 * np.maximum(deviance, 0))).ravel()
 
     def _found(self, number: int) -> tuple[np.ndarray, float, np.ndarray]:
-        """Guides [number, 2] in mm, the spread of crossings about them in mm, and the rates elsewhere and
-        about them."""
+        """Guides [number, 2] in mm, or the lens [1, 2] for none; the spread of crossings about them in mm; and
+        the rates elsewhere and about them."""
         scale_mm = 2 * abs(float(self.x_mm[0]))
         peaks_mm, rate = self._peaks(number, scale_mm)
 
         def plain(x: np.ndarray) -> tuple[np.ndarray, float, np.ndarray]:
-            return scale_mm * x[:-3].reshape(-1, 2), scale_mm * np.exp(x[-3]), np.exp(x[-2:])
+            at_mm = scale_mm * x[:-3].reshape(-1, 2) if number else np.zeros((1, 2))
+            return at_mm, scale_mm * np.exp(x[-3]), np.exp(x[-2:])
 
         first = np.r_[peaks_mm.ravel() / scale_mm, np.log([SPREAD, self.shone.sum() / self.seen.sum(), rate])]
         bounds = [(-0.5, 0.5)] * (2 * number) + [np.log([0.5 / CELLS, 1]), *[np.log([LEAST_RATE, 1])] * 2]
@@ -139,14 +162,27 @@ def crossings_mm(samples: Samples, surface: Surface) -> tuple[np.ndarray, np.nda
 
 def outshining(samples: Samples, vertex: np.ndarray, start: Start) -> tuple[np.ndarray, np.ndarray]:
     """Of which samples their ``vertex`` [N] tells what it shows without a glint, the median of its photos
-    under the light of ``start``; and which outshine that, both bool [N]."""
+    under the light of ``start`` and each photo's own exposure; and which outshine that, both bool [N]."""
     light = start.light
     log_light = light.n * samples.log_cos_axis - light.q * samples.log_distance + samples.cos.log()
     level = start.response.gamma * log_light.numpy()
     shown = samples.color[:, 1:].amin(dim=1).clamp_min(1).numpy().astype(np.float32) / 255
     albedo = np.log(shown) - level
-    count = np.bincount(vertex, minlength=1)
-    told = count >= LEAST_PIXELS
-    middle = np.zeros(len(count), np.float32)
-    middle[told] = albedo[np.lexsort((albedo, vertex))][(np.cumsum(count) - (count + 1) // 2)[told]]
-    return told[vertex], shown - np.exp(middle[vertex] + level) > OUTSHINES
+    told = np.bincount(vertex, minlength=1)[vertex] >= LEAST_PIXELS
+    view = samples.views.row(samples.frame)
+    exposure = np.zeros(len(samples.views.frames), np.float32)
+    for _ in range(EXPOSED):
+        middle = _medians(albedo - exposure[view], vertex)
+        exposure = _medians(albedo - middle[vertex], view, len(exposure))
+    expected = middle[vertex] + exposure[view] + level
+    return told, shown - np.exp(expected) > OUTSHINES
+
+
+def _medians(values: np.ndarray, group: np.ndarray, count: int = 0) -> np.ndarray:
+    """The lower median of ``values`` [N] in each ``group`` [N], float32 [count] or as many as there are; 0
+    where there are none."""
+    size = np.bincount(group, minlength=count)
+    middle = np.zeros(len(size), np.float32)
+    there = size > 0
+    middle[there] = values[np.lexsort((values, group))][(np.cumsum(size) - (size + 1) // 2)[there]]
+    return middle

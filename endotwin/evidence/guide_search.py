@@ -8,9 +8,9 @@ from functools import cache, cached_property, lru_cache
 import numpy as np
 from scipy.optimize import least_squares
 
-from endotwin.evidence.glints import Glints
+from endotwin.evidence.glints import MOST_GUIDES, Glints
 from endotwin.evidence.light_map import LightMap, places_mm
-from endotwin.evidence.probe import Fitted, Hypothesis, Probe
+from endotwin.evidence.probe import Fitted, Hypothesis, Probe, Verdict
 from endotwin.light.guides import AT_LENS
 from endotwin.pixels.fixed_effects import Design, Left
 
@@ -21,7 +21,6 @@ RADIUS = 0.12
 """By what guides' places are measured, as a share of the median viewing distance: 2.4 mm at a tip that sees
 the wall from 20 mm."""
 
-MOST_GUIDES = 3
 SEARCH_PIXELS = 8_000
 """Guides are sought with so many pixels of the probe; those that are kept are polished with all."""
 
@@ -30,6 +29,11 @@ STEPS, TOLERANCE = 12, 1e-3
 
 SEEN_GUIDES = 64
 """What so many guides see is kept: of several one is moved at a time."""
+
+BARE, BARE_HINT = Verdict(0.05, 5.0), Verdict(0.025, 2.0)
+"""What guides have to gain where no light bounces, and what is worth a search: the rest of the model is right
+to a percent there, and where the light is at the lens guides gain nothing. A bounce errs by more, for which
+they make up."""
 
 DEEPEST = 1.0
 """Of the radius: guides lie at most so far behind the lens."""
@@ -75,6 +79,11 @@ class Ground:
             visible[self._at_risk, k] = self._seen(tuple(map(float, guide)))
         return visible
 
+    def told(self, model: Fitted, verdict: Verdict) -> bool:
+        """Whether glints plainly stand about the guides of ``model``, and the pixels' ``verdict`` on it does
+        not plainly contradict them."""
+        return not verdict.contradicts and self.glints.tell(model.hypothesis.guides_mm)
+
     def of(self, hypothesis: Hypothesis) -> Hypothesis:
         """The hypothesis about these pixels."""
         if self._rows is None or hypothesis.bounced is None:
@@ -82,9 +91,15 @@ class Ground:
         return replace(hypothesis, bounced=hypothesis.bounced[self._rows])
 
 
+def worth(verdict: Verdict, beside: Hypothesis) -> bool:
+    """Whether guides ``beside`` other effects are worth their place."""
+    return verdict.keep or (beside.bounced is None and verdict.worth(BARE))
+
+
 def found_guides(ground: Ground, base: Hypothesis, forced: bool, near_mm: Guides = AT_LENS) -> Guides:
     """Positions of one to three guides that predict held-out pixels better than ``base``, camera frame; the
-    lens where none do. They are sought where they explain the glints as well, and first ``near_mm``.
+    lens where none do, and glints tell of none. They are sought where they explain the glints as well, and
+    first ``near_mm``.
 
     One guide, and a glance at two and three, tell whether a search is worth its time. Two in the plane of the
     lens pass for one behind it: another is believed only beside those before it where they are best. With
@@ -95,17 +110,22 @@ def found_guides(ground: Ground, base: Hypothesis, forced: bool, near_mm: Guides
     if near_mm != AT_LENS:
         near = replace(base, guides_mm=near_mm, shadows=True)
         near = replace(near, guides_mm=Search(ground.part, near).settled())
-        if probe.compare(plain, probe.fit(near)).keep:
+        if worth(probe.compare(plain, probe.fit(near)), base):
             return near.guides_mm
-    search = Search(ground.part, base)
-    if not forced and not search.hints():
+    search, told = Search(ground.part, base), ground.glints.told()
+    if not (forced or told or search.hints()):
         return AT_LENS
-    for number in range(1, MOST_GUIDES + 1):
+    first = 1
+    if told:
+        found = probe.fit(replace(base, guides_mm=search.best(told), shadows=True))
+        if ground.told(found, probe.compare(plain, found)):
+            best, first = found, told + 1
+    for number in range(first, MOST_GUIDES + 1):
         found = probe.fit(replace(base, guides_mm=search.best(number), shadows=True))
-        worth = probe.compare(best or plain, found).keep
-        if worth and best is not None:
-            worth = probe.compare(settled(ground, best), found).keep
-        if worth or (forced and best is None and number == MOST_GUIDES):
+        better = worth(probe.compare(best or plain, found), base)
+        if better and best is not None:
+            better = worth(probe.compare(settled(ground, best), found), base)
+        if better or (forced and best is None and number == MOST_GUIDES):
             best = found
     return AT_LENS if best is None else Search(ground.part, best.hypothesis).settled()
 
@@ -143,7 +163,9 @@ class Search:
         """Whether one guide, wherever it is best, or two or three where light gathers predict better."""
         more = [start for number in range(2, MOST_GUIDES + 1) for start in self._starts(number)]
         models = [self._probe.fit(self._with(each)) for each in (self.best(1), *more)]
-        return any(self._probe.compare(self._base, model).hints for model in models)
+        verdicts = [self._probe.compare(self._base, model) for model in models]
+        bare = self._base.hypothesis.bounced is None
+        return any(each.worth(BARE_HINT) if bare else each.hints for each in verdicts)
 
     def _best(self, number: int) -> Guides:
         """The best positions of so many guides."""

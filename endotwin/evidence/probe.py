@@ -104,6 +104,11 @@ class Verdict:
         return self.worth(Verdict(MIN_GAIN_DB, MIN_SIGMAS))
 
     @property
+    def contradicts(self) -> bool:
+        """Whether the other is as plainly worse as one that is kept is better."""
+        return self.gain_db <= -MIN_GAIN_DB and self.sigmas <= -MIN_SIGMAS
+
+    @property
     def hints(self) -> bool:
         return self.gain_db >= HINT_DB and self.sigmas >= HINT_SIGMAS
 

@@ -337,7 +337,8 @@ class LightStage:
 
     def _coated(self) -> Globals:
         """Light and response with the coat that highlights call for."""
-        layer, self._decisions["coat"] = judged_coat(self._highlights(), self._wanted["coat"])
+        wanted, tried = self._wanted["coat"], self._relighting.bounces
+        layer, self._decisions["coat"] = judged_coat(self._highlights(), wanted, tried)
         return replace(self._state.shared, coat=layer)
 
     def _choose_lobe(self) -> None:

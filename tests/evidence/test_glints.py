@@ -26,11 +26,12 @@ def bumps(guides_mm: np.ndarray, spread_mm: float) -> np.ndarray:
     return sum(np.exp(-each / 2 / spread_mm**2) for each in apart2_mm)
 
 
-def drawn(guides_mm: np.ndarray, seed: int) -> Glints:
-    """Glints of a million pixels all over the map: one in a hundred, and three in ten at a guide."""
+def drawn(guides_mm: np.ndarray, seed: int, spread_mm: float = 1.2, elsewhere: float = 0.01) -> Glints:
+    """Glints of a million pixels all over the map: three in ten at a guide, and a few everywhere."""
     rng = np.random.default_rng(seed)
     seen = rng.poisson(1_000_000 / CELLS**2, (CELLS, CELLS)).astype(float)
-    return Glints(X_MM, rng.poisson(seen * (0.01 + 0.3 * bumps(guides_mm, 1.2))).astype(float), seen)
+    shone = rng.poisson(seen * (elsewhere + 0.3 * bumps(guides_mm, spread_mm)))
+    return Glints(X_MM, shone.astype(float), seen)
 
 
 def seen_by_a_camera(rng: np.random.Generator, count: int) -> tuple[Samples, np.ndarray]:
@@ -116,3 +117,53 @@ def test_a_pixel_glints_that_outshines_its_place_in_other_photos_however_near_th
     assert shines.tolist() == [False] * 5 + [True]
     told, _ = outshining(samples, np.arange(6), start)
     assert not told.any()
+
+
+@given(seed=st.integers(0, 1000))
+@settings(max_examples=20, deadline=None)
+def test_a_photo_that_is_brighter_as_a_whole_does_not_glint(seed):
+    rng, places, photos = np.random.default_rng(seed), 30, 7
+    place, photo = (x.ravel() for x in np.divmod(np.arange(places * photos), photos))
+    log_gain, log_albedo = rng.uniform(-0.5, 0.5, photos), rng.uniform(-0.3, 0.3, places)
+    shown = 90 * np.exp(0.5 * log_gain[photo] + log_albedo[place])
+    glint = rng.integers(len(place))
+    shown[glint] += 40
+    samples, _ = seen_by_a_camera(rng, len(place))
+    views = samples.views
+    poses = np.repeat(views.T_local_camera, photos, axis=0)
+    samples = Samples(
+        **vars(samples)
+        | {
+            "color": torch.from_numpy(np.repeat(np.uint8(shown)[:, None], 3, axis=1)),
+            "log_distance": torch.zeros(len(place)),
+            "frame": torch.from_numpy(photo.astype(np.int32)),
+            "views": Views(views.camera, views.lens_mask, np.arange(photos), poses),
+        }
+    )
+    start = Start(Light(1.0, 2.0, 2.0), Response(0.5), np.ones((1, 3), np.float32), ())
+    told, shines = outshining(samples, place, start)
+    assert told.all()
+    assert np.flatnonzero(shines).tolist() == [glint]
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("number", [1, 2, 3])
+def test_glints_tell_as_many_guides_as_they_stand_about(number, seed):
+    glints = drawn(THREE_MM[:number], seed, spread_mm=0.6, elsewhere=1e-4)
+    assert glints.told() == number
+    assert glints.tell(THREE_MM[:number])
+    assert not glints.tell(-THREE_MM[:number])
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_glints_about_the_lens_tell_no_guides(seed):
+    glints = drawn(np.zeros((1, 3)), seed, elsewhere=1e-4)
+    assert glints.shone.sum() > 1000
+    assert glints.told() == 0
+
+
+def test_a_handful_of_glints_tells_no_guides():
+    shone = np.zeros((CELLS, CELLS))
+    shone[50, 40:44] = 10
+    glints = Glints(X_MM, shone, np.full((CELLS, CELLS), 100.0))
+    assert not glints.tell(np.array([[X_MM[50], X_MM[42], 0]]))
