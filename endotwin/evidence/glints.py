@@ -52,8 +52,8 @@ LEAST_RATE = 1e-6
 MOST_GUIDES = 3
 
 PLAIN, LEAST_GLINTS = 4.0, 100
-"""Guides that leave so many times less of so many glints than light at the lens does are told by them. Normals
-that err alike in many places pass for guides, too, but explain half at most."""
+"""Guides that leave so many times less of so many glints than light at the lens does are told by them.
+Normals that err alike in many places pass for guides, too, but leave two fifths at least."""
 
 
 class Glints:
@@ -121,7 +121,7 @@ class Glints:
         return (np.sign(self.shone - mean) * np.sqrt(2 * np.maximum(deviance, 0))).ravel()
 
     def _found(self, number: int) -> tuple[np.ndarray, float, np.ndarray]:
-        """Guides [number, 2] in mm, or the lens [1, 2] for none; the spread of crossings about them in mm; and
+        """Guides [number, 2] in mm, or the lens [1, 2] for none; the spread of crossings about them, mm; and
         the rates elsewhere and about them."""
         scale_mm = 2 * abs(float(self.x_mm[0]))
         peaks_mm, rate = self._peaks(number, scale_mm)

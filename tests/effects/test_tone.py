@@ -77,14 +77,14 @@ def test_dark_places_that_are_redder_are_no_curve():
     assert judged(hues_of(-0.4), "auto")[0] is None
 
 
-def beside_a_bounce(contrast: float, strength: float = 0.0):
+def beside_a_bounce(contrast: float, strength: float = 0.0, apart: float = 0.07):
     """The hues of a curve, turned as well by ``strength`` of a bounce that turns them nearly as curves do."""
     hues = hues_of(contrast)
 
     def without(tone: Tone) -> Hues:
         found = hues(tone)
         curve = found.slopes[:, -1]
-        bounce = curve + 0.07 * curve.std() * np.random.default_rng(5).standard_normal(len(curve))
+        bounce = curve + apart * curve.std() * np.random.default_rng(5).standard_normal(len(curve))
         slopes = np.c_[found.slopes[:, :-1], bounce, curve]
         return replace(found, residual=found.residual + strength * bounce, slopes=slopes)
 
@@ -98,6 +98,10 @@ def test_a_curve_is_found_beside_a_bounce_that_turns_hues_nearly_as_it_does():
 
 def test_a_bounce_of_another_strength_is_no_curve():
     assert judged(beside_a_bounce(0.0, strength=0.3), "auto")[0] is None
+
+
+def test_a_bounce_of_another_strength_makes_no_curve_of_a_faint_one():
+    assert judged(beside_a_bounce(0.07, strength=0.3, apart=0.6), "auto")[0] is None
 
 
 def test_a_curve_is_on_and_off_as_it_is_asked_for():
