@@ -55,7 +55,7 @@ def test_a_haze_brighter_than_water_does_not_ruin_a_bounce(tmp_path: Path, monke
     """Whatever the highlights say: all pixels of such tissue give it hardly any weight, or are worse."""
     said = Decision("on", "the highlights say so", 1.1)
     haze = Coat(weight=7.0, roughness=0.32, tail=1.0)
-    monkeypatch.setattr(light_stage, "judged_coat", lambda highlights, wanted: (haze, said))
+    monkeypatch.setattr(light_stage, "judged_coat", lambda highlights, wanted, tried: (haze, said))
     twin, made = fitted(tmp_path, 224, {"interreflection"})
     assert "interreflection" in twin.effects and said.reason in twin.decisions["coat"].reason
     assert "coat" not in twin.effects or twin.effects["coat"].weight < 0.05 * haze.weight

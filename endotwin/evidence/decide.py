@@ -134,7 +134,8 @@ class _Trial:
         return self._wanted.get(name, "auto")
 
     def together(self) -> Fitted:
-        """What remains of the best set of the effects that are decided together."""
+        """What remains of the best set of the effects that are decided together, each beside a vignetting
+        that there may be: it would hide guides, or pass for a bounce and a gain."""
         lens = self._sets(("interreflection", "gain"))
         best = self._best(lens)
         if self.wanted("offset") != "off" and len(self._probe):
@@ -147,7 +148,7 @@ class _Trial:
         kept, verdicts = self._pruned(self._best(sets))
         for name in TOGETHER:
             self._say(name, name in kept, verdicts.get(name) or self._beside_kept(name, kept))
-        return self._model(kept)
+        return self._probe.fit(replace(self._model(kept).hypothesis, vignetting=False))
 
     def _seek_guides(self, best: frozenset[str]) -> None:
         """Find the guides without and with bounced light, if there are any beside the ``best`` set without
@@ -158,7 +159,7 @@ class _Trial:
         those farther out may not show.
         """
         best, _ = self._pruned(best, ("gain",))
-        base = replace(self._model(best).hypothesis, vignetting=self.wanted("vignetting") != "off")
+        base = self._model(best).hypothesis
         bounces = base.bounced is not None
         found_mm = other_mm = self._found_guides(base, self.wanted("offset") == "on")
         none = bounces and found_mm == AT_LENS
@@ -268,7 +269,7 @@ class _Trial:
 
     def _fitted(self, names: frozenset[str]) -> Fitted:
         began = time.perf_counter()
-        hypothesis = Hypothesis(gain="gain" in names)
+        hypothesis = Hypothesis(gain="gain" in names, vignetting=self.wanted("vignetting") != "off")
         if "offset" in names:
             guides_mm = self._guides_mm["interreflection" in names]
             hypothesis = replace(hypothesis, guides_mm=guides_mm, shadows=True)
