@@ -173,7 +173,7 @@ def outshining(samples: Samples, vertex: np.ndarray, start: Start) -> tuple[np.n
     exposure = np.zeros(len(samples.views.frames), np.float32)
     for _ in range(EXPOSED):
         middle = _medians(albedo - exposure[view], vertex)
-        exposure = _medians(albedo - middle[vertex], view, len(exposure))
+        exposure = _medians((albedo - middle[vertex])[told], view[told], len(exposure))
     expected = middle[vertex] + exposure[view] + level
     return told, shown - np.exp(expected) > OUTSHINES
 

@@ -207,6 +207,17 @@ def test_guides_that_stand_far_out_for_how_near_the_wall_is_are_found(tmp_path):
         assert np.linalg.norm(np.subtract(found, true_mm), axis=1).min() < 0.7
 
 
+def test_guides_two_millimetres_from_the_lens_are_found_where_no_light_bounces(tmp_path):
+    """A tenth of a decibel off the highlights, and three with them."""
+    made = make(Scene.draw(400).having(frozenset(("offset", "shadows", "coat"))), tmp_path)
+    decided = decide(*reordered(scene(tmp_path, 1.0)), {})
+    on = {name for name, state in states(decided).items() if state == "on"}
+    assert "offset" in on and not on & {"interreflection", "gain"}
+    for true_mm in made["guides_mm"]:
+        apart_mm = np.linalg.norm(np.subtract(decided.effects["offset"].guides_mm, true_mm), axis=1)
+        assert apart_mm.min() < 0.7
+
+
 @pytest.fixture(scope="module")
 def lit_from_beside():
     return scene(DATA / "colon_offset", 0.5)
