@@ -131,6 +131,14 @@ def test_photos_without_a_tone_curve_get_none_whatever_the_light():
         assert judged_tone(seen, "auto")[0] is None
 
 
+def test_a_hint_of_a_coat_is_enough_where_all_pixels_are_asked_next():
+    within, material = photographed(replace(TRUE, coat=Coat(0.15, 0.13, 2.0)))
+    highlights = within.highlights(material, TRUE, NOISE)
+    assert judged(highlights, "auto")[0] is None
+    coat, decision = judged(highlights, "auto", tried=True)
+    assert decision.state == "on" and coat.weight > 0
+
+
 def test_tissue_without_a_coat_gets_none_and_one_that_is_forced_on_weighs_nothing():
     within, material = photographed()
     assert judged(within.highlights(material, TRUE, NOISE), "auto")[0] is None
