@@ -53,7 +53,7 @@ MOST_GUIDES = 3
 
 PLAIN, LEAST_GLINTS = 4.0, 100
 """Guides that leave so many times less of so many glints than light at the lens does are told by them.
-Normals that err alike in many places pass for guides, too, but leave two fifths at least."""
+Normals that err alike in many places pass for guides, too, but on random scenes left 39 % at least."""
 
 
 class Glints:
