@@ -61,7 +61,7 @@ def judged(without: Callable[[Tone], Hues], wanted: str) -> tuple[Tone | None, D
     Where light bounces they have to call for one beside a bounce of any strength, too: what the bounce
     lacks turns hues as well, most of all where its strength is found too far off. Beside the bounce that was
     found without a curve, and has made up for one, they ask for too little; beside any, for too much: the
-    curve is taken to be halfway.
+    curve is taken to be halfway, and is none where even these ask for none.
 
     Args:
         without: the hues, by the curve that is taken off.
@@ -75,7 +75,8 @@ def judged(without: Callable[[Tone], Hues], wanted: str) -> tuple[Tone | None, D
         f"a contrast of {curve.contrast:.2f} predicts held-out hues better by {each}"
         for curve, each in trials
     )
-    sure = all(each.sigmas >= MIN_SIGMAS and curve.contrast >= LEAST_CONTRAST for curve, each in trials)
+    least = min(tone.contrast, trials[-1][0].contrast)
+    sure = all(each.sigmas >= MIN_SIGMAS for _, each in trials) and least >= LEAST_CONTRAST
     gain_db, took_s = round(verdict.gain_db, 3), round(time.perf_counter() - began, 3)
     if wanted == "auto" and not sure:
         return None, Decision("off", f"none that counts: {told}", gain_db, took_s)
