@@ -9,6 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from endotwin.effects.tone import Tone, bend
+from endotwin.evidence import tone as evidence
+from endotwin.evidence.probe import Verdict
 from endotwin.evidence.tone import LEAST_CONTRAST, Hues, judged, steadied
 
 CONTRASTS = st.floats(0, 0.9)
@@ -102,6 +104,17 @@ def test_a_bounce_of_another_strength_is_no_curve():
 
 def test_a_bounce_of_another_strength_makes_no_curve_of_a_faint_one():
     assert judged(beside_a_bounce(0.07, strength=0.3, apart=0.6), "auto")[0] is None
+
+
+@pytest.mark.parametrize(("found", "any_strength", "on"), [(0.09, 0.35, True), (0.34, 0.04, False)])
+def test_beside_a_bounce_that_has_made_up_for_it_a_curve_may_be_faint_but_not_beside_any(
+    monkeypatch, found, any_strength, on
+):
+    trials = [(Tone(contrast), Verdict(0.2, 30.0)) for contrast in (found, any_strength)]
+    monkeypatch.setattr(evidence, "_trials", lambda without: trials)
+    curve, _ = judged(hues_of(0.0), "auto")
+    assert (curve is not None) == on
+    assert not on or curve.contrast == pytest.approx((found + any_strength) / 2)
 
 
 def test_a_curve_is_on_and_off_as_it_is_asked_for():
