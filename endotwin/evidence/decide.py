@@ -316,7 +316,7 @@ class _Trial:
     def _worth_within(self, names: frozenset[str], name: str, verdict: Verdict) -> bool:
         if name == "offset":
             model = self._model(names)
-            return worth(verdict, model.hypothesis) or self._ground.told(model, verdict)
+            return worth(verdict, model.hypothesis) or self._ground.certain(model, verdict)
         told = name != "gain" or "interreflection" not in names or verdict.gain_db >= PLAIN_DB
         told = told or float(self._model(names).log_gain.std()) >= LEAST_GAIN
         return told and _worth(name, verdict)

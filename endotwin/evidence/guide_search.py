@@ -79,7 +79,7 @@ class Ground:
             visible[self._at_risk, k] = self._seen(tuple(map(float, guide)))
         return visible
 
-    def told(self, model: Fitted, verdict: Verdict) -> bool:
+    def certain(self, model: Fitted, verdict: Verdict) -> bool:
         """Whether glints plainly stand about the guides of ``model``, and the pixels' ``verdict`` on it does
         not plainly contradict them."""
         return not verdict.contradicts and self.glints.tell(model.hypothesis.guides_mm)
@@ -106,22 +106,25 @@ def found_guides(ground: Ground, base: Hypothesis, forced: bool, near_mm: Guides
     ``forced`` there is always a position: that of the most guides, if none is worth it.
     """
     probe = ground.probe
-    plain, best = probe.fit(base), None
+    plain, best, first = probe.fit(base), None, 1
+
+    def under(guides_mm: Guides) -> Fitted:
+        return probe.fit(replace(base, guides_mm=guides_mm, shadows=True))
+
     if near_mm != AT_LENS:
         near = replace(base, guides_mm=near_mm, shadows=True)
-        near = replace(near, guides_mm=Search(ground.part, near).settled())
-        if worth(probe.compare(plain, probe.fit(near)), base):
-            return near.guides_mm
+        near = under(Search(ground.part, near).settled())
+        if worth(probe.compare(plain, near), base):
+            return near.hypothesis.guides_mm
     search, told = Search(ground.part, base), ground.glints.told()
     if not (forced or told or search.hints()):
         return AT_LENS
-    first = 1
     if told:
-        found = probe.fit(replace(base, guides_mm=search.best(told), shadows=True))
-        if ground.told(found, probe.compare(plain, found)):
+        found = under(search.best(told))
+        if ground.certain(found, probe.compare(plain, found)):
             best, first = found, told + 1
     for number in range(first, MOST_GUIDES + 1):
-        found = probe.fit(replace(base, guides_mm=search.best(number), shadows=True))
+        found = under(search.best(number))
         better = worth(probe.compare(best or plain, found), base)
         if better and best is not None:
             better = worth(probe.compare(settled(ground, best), found), base)
