@@ -17,6 +17,7 @@ from endotwin.align.coupled import coupled
 from endotwin.align.motion import moved
 from endotwin.config import FuseConfig
 from endotwin.pixels.length_unit import unit_mm
+from endotwin.robust import robust_std
 from endotwin.run.ahead import ahead
 from endotwin.run.threads import THREADS
 from endotwin.sequence import Sequence
@@ -92,7 +93,7 @@ class _Beside:
         rows = np.flatnonzero(near & (-dot(normals, rays) > GRAZING))
         normals, measured, met = normals[rows], measured[rows], met[rows]
         distance_mm = dot(normals, measured - met)
-        width_mm = max(1.4826 * float(np.median(np.abs(distance_mm))), 1e-6) if len(rows) else 1e-6
+        width_mm = robust_std(distance_mm, 1e-6)
         weight = 1 / np.maximum(1, np.abs(distance_mm) / (HUBER * width_mm)) / (width_mm**2 * ALIKE)
         slopes = np.concatenate([np.cross(measured, normals), normals], axis=1)
         return cls(met @ pose[:3, :3].T + pose[:3, 3], distance_mm, slopes, weight, width_mm)

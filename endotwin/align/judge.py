@@ -13,6 +13,7 @@ from endotwin.align.scene import Scene
 from endotwin.align.solve import even, paint_of
 from endotwin.align.texture import sighted
 from endotwin.align.within import Within, within
+from endotwin.robust import robust_std
 
 LEAST = 100
 """A photo judges by no fewer vertices, or pixels beside rims."""
@@ -46,7 +47,7 @@ class Errors:
         for mine, others in ((self.texture, other.texture), (self.rims, other.rims)):
             both = [k for k in range(len(mine)) if mine[k] is not None and others[k] is not None]
             if both:
-                width = 1.4826 * np.median(np.abs(np.concatenate([others[k] for k in both])))
+                width = robust_std(np.concatenate([others[k] for k in both]))
                 total[both, 0] += [_loss(others[k], width) for k in both]
                 total[both, 1] += [_loss(mine[k], width) for k in both]
         total = total[total[:, 0] > 0]

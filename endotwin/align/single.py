@@ -12,6 +12,7 @@ from endotwin.align.photos import DARKEST, Photo, log_blurred
 from endotwin.align.rims import BAND_SIGMAS, least_within, moving_slopes
 from endotwin.align.scene import Scene
 from endotwin.align.within import HUBER
+from endotwin.robust import robust_std
 
 BLURS = (0.006, 0.003, 0.0015, 0.0015)
 """Widths of the blurs, coarse to fine, of the image's width."""
@@ -53,7 +54,7 @@ def placed(
         slopes = moving_slopes(scene, predicted, pixel, nearest_mm)[:, :6]
         left = (shown - predicted).reshape(-1)[pixel].astype(np.float64)
         left -= np.median(left)
-        width = max(1.4826 * float(np.median(np.abs(left))), 1e-3)
+        width = robust_std(left, 1e-3)
         weight = 1 / np.maximum(1, np.abs(left) / (HUBER * width))
         weight /= width**2 * ALIKE * 4 * np.pi * sigma_px**2
         slopes = slopes - np.average(slopes, axis=0, weights=weight)

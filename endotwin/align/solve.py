@@ -21,6 +21,7 @@ from endotwin.align.photos import Photo
 from endotwin.align.rims import Paint, Rim, rim
 from endotwin.align.scene import Scene
 from endotwin.align.within import HUBER, ROUNDS, Within, within
+from endotwin.robust import robust_std
 from endotwin.run.ahead import ahead
 from endotwin.run.threads import THREADS
 
@@ -85,7 +86,7 @@ def even(seen: Rim) -> tuple[np.ndarray, np.ndarray, float]:
     for _ in range(ROUNDS):
         mean = np.bincount(seen.stretch, weight * seen.residual) / np.bincount(seen.stretch, weight)
         left = seen.residual - mean[seen.stretch]
-        width = max(1.4826 * float(np.median(np.abs(left))), 1e-3)
+        width = robust_std(left, 1e-3)
         weight = 1 / np.maximum(1, np.abs(left) / (HUBER * width))
     return left, weight, width
 

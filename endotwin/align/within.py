@@ -11,6 +11,7 @@ from endotwin.align.coupled import coupled
 from endotwin.align.photos import Photo
 from endotwin.align.scene import SHADING, SHADING_MEAN, SHADING_SPREAD, Scene
 from endotwin.align.texture import LIGHT_CELLS, sighted
+from endotwin.robust import robust_std
 from endotwin.run.ahead import ahead
 from endotwin.run.threads import THREADS
 
@@ -100,11 +101,11 @@ def _explained(shown: np.ndarray, columns: np.ndarray, groups: _Groups, often: n
     for _ in range(2):
         left = groups.without(np.c_[columns, shown], weight)
         a, r = left[:, :SHADING], left[:, SHADING]
-        width = max(1.4826 * float(np.median(np.abs((r - a @ light)[often]))), 1e-3) if often.any() else 1.0
+        width = robust_std((r - a @ light)[often], 1e-3) if often.any() else 1.0
         normal = (a * weight[:, None]).T @ a / width**2 + np.diag(1 / SHADING_SPREAD**2)
         right = a.T @ (weight * r) / width**2 + SHADING_MEAN / SHADING_SPREAD**2
         light = np.linalg.solve(normal, right)
         residual = r - a @ light
-        width = max(1.4826 * float(np.median(np.abs(residual[often]))), 1e-3) if often.any() else 1.0
+        width = robust_std(residual[often], 1e-3) if often.any() else 1.0
         weight = 1 / np.maximum(1, np.abs(residual) / (HUBER * width))
     return light, weight, width, residual

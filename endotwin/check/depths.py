@@ -7,6 +7,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from endotwin.robust import robust_std
+
 LEAST_COSINE = 0.25
 """Pixels whose ray is farther off the optical axis are left alone: z-depth says nothing at 90°."""
 
@@ -78,7 +80,7 @@ def _spread(bends: list[np.ndarray]) -> float:
     """Relative noise from second differences, whose variance is six times the noise's."""
     sparse = [bend[1::4, 1::3] for bend in bends]
     seen = np.concatenate([bend[np.isfinite(bend)] for bend in sparse])
-    return 1.4826 * float(np.median(seen)) / np.sqrt(6) if len(seen) else 0.0
+    return robust_std(seen) / np.sqrt(6)
 
 
 def _step(depth_mm: np.ndarray) -> float:

@@ -13,6 +13,7 @@ from endotwin.check.findings import Finding
 from endotwin.check.photo import correlation
 from endotwin.check.reading import Reading
 from endotwin.check.stream import LEAST_DEPTH, Shot, Step, misfit_of, pair_of, shots_and_steps
+from endotwin.robust import robust_std
 from endotwin.sequence import Sequence
 
 LEAST_MISFIT = 0.003
@@ -161,7 +162,7 @@ def _fitting_shift(
 def _strange_photos(names: list[str], steps: list[Step], match: np.ndarray, told: set[str]) -> list[Finding]:
     """Frames whose photo fits a neighbour's depth better than its own, or none at all."""
     usual = float(np.nanmedian(match))
-    spread = 1.4826 * float(np.nanmedian(np.abs(match - usual)))
+    spread = robust_std((match - usual)[np.isfinite(match)])
     of_other = np.full(len(match), -1.0)
     for step in steps:
         of_other[step.index] = max(of_other[step.index], np.nan_to_num(step.after, nan=-1))
@@ -187,7 +188,7 @@ def _blurred(names: list[str], sharpness: np.ndarray) -> list[Finding]:
         return []
     finite = np.where(np.isfinite(sharpness), sharpness, -10.0)
     drop = median_filter(finite, size=min(15, len(finite) // 2 * 2 - 1), mode="reflect") - finite
-    spread = 1.4826 * float(np.median(np.abs(drop - np.median(drop))))
+    spread = robust_std(drop - np.median(drop))
     some = [names[index] for index in np.flatnonzero(drop > max(LEAST_BLUR, 8 * spread))]
     if not some:
         return []

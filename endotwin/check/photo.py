@@ -17,6 +17,7 @@ import cv2
 import numpy as np
 
 from endotwin.check.depths import LEAST_COSINE, QUIET, prepared
+from endotwin.robust import robust_std
 from endotwin.run.ahead import ahead
 from endotwin.sequence import Sequence
 from endotwin.sequence.spread import spread
@@ -192,7 +193,7 @@ def _offset_of(
     if len(offsets) < 3:
         return np.full(2, np.nan), np.full(2, np.nan)
     middle = np.median(offsets, axis=0)
-    spread = 1.4826 * np.median(np.abs(offsets - middle), axis=0)
+    spread = np.array([robust_std(offset) for offset in (offsets - middle).T])
     return middle, np.maximum(1.25 * spread / np.sqrt(len(offsets)), 0.02)
 
 
@@ -250,7 +251,7 @@ def _robust_solution(design: np.ndarray, values: np.ndarray) -> np.ndarray:
         weighted = design * weight[:, None]
         solution = np.linalg.solve(weighted.T @ design + 1e-6 * np.eye(3), weighted.T @ values)
         error = np.abs(values - design @ solution)
-        weight = 1 / (1 + (error / (1.4826 * np.median(error) + 0.05)) ** 2) ** 2
+        weight = 1 / (1 + (error / (robust_std(error) + 0.05)) ** 2) ** 2
     return solution
 
 

@@ -18,6 +18,7 @@ from endotwin.check.photo import brightest, correlation, reduced_photo, reduced_
 from endotwin.check.reading import Reading
 from endotwin.check.views import Views, sampled
 from endotwin.check.warp import landed, residuals
+from endotwin.robust import robust_std
 from endotwin.run.ahead import ahead
 from endotwin.sequence import Sequence
 
@@ -160,7 +161,7 @@ def misfit_of(views: Views, reading: Reading) -> tuple[float, float]:
     r, J = residual[good], slopes[good] / np.abs(slopes[good]).mean(axis=0)
     steep = np.abs(J).max(axis=1) > 20
     r, J = r[~steep], J[~steep]
-    width = max(1.4826 * float(np.median(np.abs(r))), 1e-7)
+    width = robust_std(r, 1e-7)
     weight = 1 / (1 + (r / (2 * width)) ** 2)
     curvature = (J * weight[:, None]).T @ J + 1e-9 * np.eye(6)
     pull = J.T @ (weight * r)

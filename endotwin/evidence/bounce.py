@@ -13,6 +13,7 @@ from endotwin.light.bounced import Albedo, BouncedLight, Places
 from endotwin.light.forward import Lobes
 from endotwin.light.radiosity import Radiosity
 from endotwin.light.shading import F0_DIELECTRIC, ROUGHNESS_TISSUE
+from endotwin.pixels.samples import Samples
 from endotwin.pixels.start import PRIOR
 from endotwin.run.ahead import on_all_cores
 
@@ -28,9 +29,9 @@ PROBE_ALBEDOS = (0.55, 0.7, 0.85)
 FIXED_POINT_ROUNDS = 2
 
 
-def cell_mm(log_distance: np.ndarray) -> float:
-    """Size of the patches for a scene seen from distances with logarithms [N]."""
-    return CELL * float(np.exp(np.median(log_distance)))
+def cell_mm(samples: Samples) -> float:
+    """Size of the patches for a scene that is seen as ``samples`` are."""
+    return CELL * samples.distance_mm
 
 
 class Surroundings:
@@ -38,8 +39,7 @@ class Surroundings:
 
     def __init__(self, probe: Probe):
         self._probe, samples, roughness = probe, probe.samples, torch.tensor(ROUGHNESS_TISSUE)
-        size_mm = cell_mm(samples.log_distance.numpy())
-        radiosity = Radiosity(probe.twin.surface, probe.caster, size_mm, PROBE_RAYS)
+        radiosity = Radiosity(probe.twin.surface, probe.caster, cell_mm(samples), PROBE_RAYS)
         self._radiosity, self._patch = radiosity, radiosity.patch_of[samples.triangle.numpy()]
         self._places = Places(radiosity.to_points(probe.local_points_mm, probe.local_normals), probe.frame)
         self._linear = (np.maximum(samples.color.numpy(), 1) / 255.0) ** (1 / PRIOR["gamma"])

@@ -67,7 +67,10 @@ def judged(
     if wanted == "off":
         return None, Decision("off", "forced off")
     began = time.perf_counter()
-    coat, verdict = best_coat(under)
+    search = _Search(under, under(Coat(0.0)))
+    found = search.best()
+    coat = Coat(0.0) if found is None else found.coat
+    verdict = Verdict(0.0, 0.0) if found is None else search.verdict(found)
     took_s = round(time.perf_counter() - began, 3)
     forced = "forced on; " if wanted == "on" else ""
     enough = verdict.hints if tried else verdict.keep
@@ -78,29 +81,10 @@ def judged(
     return coat, Decision("on", reason, round(verdict.gain_db, 3), took_s)
 
 
-def best_coat(under: Callable[[Coat], Highlights]) -> tuple[Coat, Verdict]:
-    """The coat that predicts highlights best, and by how much better than none it does on vertices that did
-    not choose its weight.
-
-    Lobes are ranked, and judged, where their weight is nearly found: a coat may outshine what is under it,
-    where the logarithm is far from linear in its weight. One that hardly any sighting could have seen weighs
-    nothing.
-    """
-    dull = under(Coat(0.0))
-    if len(dull.residual) < LEAST_SIGHTINGS:
-        return Coat(0.0), Verdict(0.0, 0.0)
-    search = _Search(under, dull)
-    every = [search.under_lobe(roughness, tail) for tail in TAILS for roughness in ROUGHNESSES]
-    found = [each for each in every if each is not None]
-    for tail in TAILS:
-        if of_tail := [each for each in found if each.coat.tail == tail]:
-            beside = (min(of_tail, key=_LOSS).coat.roughness * step for step in FINER)
-            finer = (search.under_lobe(each, tail) for each in beside if each >= ROUGHNESSES[0])
-            found += [each for each in finer if each is not None]
-    if not found:
-        return Coat(0.0), Verdict(0.0, 0.0)
-    best = min(found, key=_LOSS)
-    return best.coat, search.verdict(best)
+def best_coat(under: Callable[[Coat], Highlights]) -> Coat | None:
+    """The coat that predicts highlights best; None where no coat is worth one."""
+    found = _Search(under, under(Coat(0.0))).best()
+    return None if found is None else found.coat
 
 
 @dataclass(frozen=True)
@@ -119,6 +103,10 @@ _LOSS = attrgetter("loss")
 class _Search:
     """Coats held against none.
 
+    Lobes are ranked, and judged, where their weight is nearly found: a coat may outshine what is under it,
+    where the logarithm is far from linear in its weight. One that hardly any sighting could have seen weighs
+    nothing.
+
     Attributes:
         under: the highlights, by the coat whose weight is sought. dull: those beside none.
     """
@@ -136,7 +124,20 @@ class _Search:
         bare = _fitted(self.dull.residual, _bare(self.dull.design), self._width)
         return bare.loss - WORTH * self._width**2
 
-    def under_lobe(self, roughness: float, tail: float) -> _Found | None:
+    def best(self) -> _Found | None:
+        """The coat that predicts highlights best, if any is worth one."""
+        if len(self.dull.residual) < LEAST_SIGHTINGS:
+            return None
+        every = [self._under_lobe(roughness, tail) for tail in TAILS for roughness in ROUGHNESSES]
+        found = [each for each in every if each is not None]
+        for tail in TAILS:
+            if of_tail := [each for each in found if each.coat.tail == tail]:
+                beside = (min(of_tail, key=_LOSS).coat.roughness * step for step in FINER)
+                finer = (self._under_lobe(each, tail) for each in beside if each >= ROUGHNESSES[0])
+                found += [each for each in finer if each is not None]
+        return min(found, key=_LOSS, default=None)
+
+    def _under_lobe(self, roughness: float, tail: float) -> _Found | None:
         """The weight of a lobe, where it is worth one."""
         lobe = Coat(0.0, roughness, tail)
         _, found = self._beside(lobe)

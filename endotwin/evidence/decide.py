@@ -381,7 +381,7 @@ class _Trial:
         if hypothesis.shadows:
             effects.append(Shadows())
         if hypothesis.bounced is not None:
-            effects.append(Interreflection(cell_mm(probe.samples.log_distance.numpy())))
+            effects.append(Interreflection(cell_mm(probe.samples)))
         if self._decisions["profile"].state == "on":
             effects.append(Profile(hypothesis.profile))
         if hypothesis.gain:

@@ -77,7 +77,7 @@ class Glints:
         at_mm, steep = crossings_mm(samples, surface)
         told, shines = outshining(samples, vertex, start)
         told &= steep
-        reach_mm = REACH * float(np.exp(np.median(samples.log_distance.numpy())))
+        reach_mm = REACH * samples.distance_mm
         edges = np.linspace(-reach_mm, reach_mm, CELLS + 1)
         shone, seen = (np.histogram2d(*at_mm[rows].T, (edges, edges))[0] for rows in (told & shines, told))
         return cls((edges[1:] + edges[:-1]) / 2, shone, seen)

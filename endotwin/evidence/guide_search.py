@@ -53,7 +53,7 @@ class Ground:
 
     def __init__(self, probe: Probe, glints: Glints, rows: np.ndarray | None = None):
         self.probe, self.glints, self._rows = probe, glints, rows
-        self.radius_mm = RADIUS * float(np.exp(np.median(probe.samples.log_distance.numpy())))
+        self.radius_mm = RADIUS * probe.samples.distance_mm
         self.places_mm = places_mm(self.radius_mm)
         self._seen = lru_cache(SEEN_GUIDES)(lambda guide: probe.visible(np.float32(guide), self._at_risk))
 

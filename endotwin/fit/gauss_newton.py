@@ -31,6 +31,7 @@ from endotwin.light.bounced import WITH_ALL
 from endotwin.light.shading import F0_DIELECTRIC
 from endotwin.pixels.samples import Samples, drawn
 from endotwin.pixels.start import LIGHT_MEAN, LIGHT_SPREAD, PRIOR
+from endotwin.robust import robust_std
 
 CPU = torch.device("cpu")
 
@@ -140,7 +141,7 @@ class GaussNewton:
         self.solve_s = 0.0
         self.out_of_time = out_of_time
         chosen = drawn(len(samples), SEARCH_SAMPLES, np.random.default_rng(seed))
-        self.trial_rows = torch.from_numpy(chosen)
+        self.trial_rows = torch.from_numpy(chosen) if len(chosen) < len(samples) else slice(None)
         self.relight(samples)
         self.squared_adjoint = _squared(self._operator.adjoint_csr)
 
@@ -167,7 +168,7 @@ class GaussNewton:
 
     def _noise(self, state: State) -> float:
         error = self._trial.color.float() / 255 - self._predict(state)
-        return max(1.4826 * float(error.abs().median()), NOISE_MIN)
+        return robust_std(error.cpu().numpy(), NOISE_MIN)
 
     def tried(self, state: State) -> tuple[Samples, Tensor]:
         """The trial samples, and what is shown of them, display values [N, 3]."""
@@ -307,7 +308,7 @@ class GaussNewton:
 
     def _brightened(self, log_gain: np.ndarray) -> Samples:
         """The trial samples with frames brighter by ``log_gain`` [F]."""
-        by_sample = torch.from_numpy(log_gain[self._frames.row[self.trial_rows.numpy()]]).float()
+        by_sample = torch.from_numpy(log_gain[self._frames.row])[self.trial_rows].float()
         return replace(self._trial, log_exposure=self._trial.log_exposure + by_sample.to(self._device))
 
     def _predict(self, state: State, log_gain: np.ndarray = _NO_GAINS) -> Tensor:

@@ -344,8 +344,7 @@ class LightStage:
     def _choose_lobe(self) -> None:
         """Take the lobe that highlights call for beside what was found with the one that was chosen without a
         coat, if there is one."""
-        if self._state.shared.coat is not None:
-            coat, _ = best_coat(self._highlights())
+        if self._state.shared.coat is not None and (coat := best_coat(self._highlights())) is not None:
             self._state = replace(self._state, shared=replace(self._state.shared, coat=coat))
 
     def _highlights(self) -> Callable[[Coat], Highlights]:

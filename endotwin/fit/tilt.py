@@ -21,6 +21,7 @@ from endotwin.fit.state import State
 from endotwin.light.guides import Incoming
 from endotwin.light.incidence import COS_MIN
 from endotwin.pixels.samples import Samples
+from endotwin.robust import robust_std
 from endotwin.run.ahead import on_all_cores
 from endotwin.surface.vectors import dot, unit
 
@@ -80,7 +81,7 @@ class Tilter:
         steep = residual.weight.all(dim=1) & (slope.abs() * np.radians(STEEP_DEG) > STEEP * noise)
         if int(steep.sum()) < LEAST_STEEP:
             return 0.0
-        return 1.4826 * float((error[steep] / slope[steep]).abs().median())
+        return robust_std((error[steep] / slope[steep]).numpy())
 
     def _assembled(self, normals: np.ndarray, noise: float, between: float) -> tuple[np.ndarray, np.ndarray]:
         """Sums over the samples of each triangle, by the tilt of its corners along the world's axes.

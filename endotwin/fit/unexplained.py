@@ -14,6 +14,7 @@ from torch import Tensor
 from endotwin.effects import Decision
 from endotwin.effects.noise import LEVEL, Noise
 from endotwin.pixels.samples import Samples
+from endotwin.robust import robust_std
 from endotwin.sequence import Sequence
 
 FRAMES = 4
@@ -72,7 +73,7 @@ def cast_warning(remains: Remains) -> str | None:
         return None
     off = remains.casts - np.nanmedian(remains.casts, axis=0)
     size = np.where(known, np.abs(off), 0.0)
-    width = 1.4826 * np.median(size[known])
+    width = robust_std(size[known])
     odd = np.flatnonzero(size.max(axis=1) > max(CAST, CAST_WIDTHS * width))
     if not len(odd):
         return None

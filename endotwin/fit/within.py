@@ -274,7 +274,7 @@ class Within:
         coefficients."""
         mean, spread = (x.numpy() for x in global_prior(self.unit_mm, len(shared.vector)))
         known = np.zeros(seen.by_varied.shape[1])
-        known[: 3 * varied.guides] = TEMPER / (ASIDE_SPREAD * self.distance_mm) ** 2
+        known[: 3 * varied.guides] = TEMPER / (ASIDE_SPREAD * self.samples.distance_mm) ** 2
         sure = TEMPER / spread**2
         parts = [free.T @ np.diag(sure) @ free, np.diag(known)]
         pulls = [free.T @ (sure * (mean - shared.vector.numpy())), 0 * known]
@@ -288,11 +288,6 @@ class Within:
             parts.append([[TEMPER / COAT_SPREAD**2]])
             pulls.append([-TEMPER * shared.coat.weight / COAT_SPREAD**2])
         return np.hstack(columns), (scipy.linalg.block_diag(*parts), np.concatenate(pulls))
-
-    @property
-    def distance_mm(self) -> float:
-        """Median viewing distance."""
-        return float(self.samples.log_distance.median().exp())
 
     def sightings(
         self,
@@ -365,7 +360,7 @@ class Within:
         channels, of those ``predicted`` [R, 3], of which the photo ``tells`` [R, 3]."""
         slopes = np.zeros((3 * varied.guides, len(rows)))
         if varied.guides:
-            step_mm, material = ASIDE * self.distance_mm, material[rows]
+            step_mm, material = ASIDE * self.samples.distance_mm, material[rows]
             for slope, moved in zip(slopes, varied.aside(self.samples[rows], step_mm), strict=True):
                 change = (predict(moved, material, shared) - predicted) * tells
                 slope[:] = change.mean(dim=1).numpy() / step_mm

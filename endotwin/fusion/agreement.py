@@ -9,6 +9,7 @@ import numpy as np
 
 from endotwin.cameras import Camera
 from endotwin.fusion.views import View
+from endotwin.robust import robust_std
 from endotwin.run.ahead import ahead
 from endotwin.surface import Surface
 from endotwin.surface.casting import Caster
@@ -97,7 +98,7 @@ def measured_noise(camera: Camera, surface: Surface, views: Iterable[View]) -> f
         if hit.any():
             measured_mm = seen.view.distance_mm.reshape(-1)[hit]
             spreads.append(np.median(np.abs(seen.residual_mm[hit]) / measured_mm))
-    return 1.4826 * float(np.median(spreads)) if spreads else 0.0
+    return robust_std(np.array(spreads))
 
 
 def agreement(camera: Camera, surface: Surface, views: Iterable[View], tolerance: Tolerance) -> Agreement:

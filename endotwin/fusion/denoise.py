@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 
 from endotwin.fusion.views import View
+from endotwin.robust import robust_std
 
 STEP_SIGMAS = 3.0
 """Neighbours whose distances differ by so many standard deviations of the noise count for little."""
@@ -31,7 +32,7 @@ def pixel_noise(views: Iterable[View]) -> float:
         bend = np.abs(np.diff(np.log(view.distance_mm[::ROW_STEP]), n=2, axis=1))
         bend = bend[np.isfinite(bend)]
         if len(bend):
-            spreads.append(1.4826 * float(np.median(bend)) / 6**0.5)
+            spreads.append(robust_std(bend) / 6**0.5)
     return float(np.median(spreads[1:] or spreads))
 
 

@@ -223,18 +223,13 @@ class BouncedLight:
         those of BOUNCES_BY that are to change; each of them takes its time.
         """
 
-        def log_irradiance(n: float, q: float, log_scale: float, albedo: Albedo = albedo) -> np.ndarray:
-            return np.log(np.maximum(self.at(places, n, q, albedo.scaled(log_scale)), DARKEST))
-
-        scaled, about = albedo.scaled(log_scale), np.array([n, q, log_scale])
-        direct, arriving = self._between(n, q, scaled)
-        irradiance = np.maximum(places.of(arriving[: self._radiosity.count]), DARKEST)
-        here = np.log(irradiance)
-        moved = [tuple(about + LIGHT_STEP * (np.array(BOUNCES_BY) == name)) for name in by]
-        gamma, by_gamma = 0.0, np.zeros_like(here)
+        about, gamma = np.array([n, q, log_scale]), 0.0
+        moved = [(*(about + LIGHT_STEP * (np.array(BOUNCES_BY) == name)), albedo) for name in by]
         if seen_by is not None:
-            moved.append((n, q, log_scale, seen_by[1]))
-        changed = [found - here for found in on_all_cores(lambda at: log_irradiance(*at), moved)]
+            moved.append((*about, seen_by[1]))
+        jobs = [(*about, albedo, gloss is not None), *((*each, False) for each in moved)]
+        (here, surroundings), *found = on_all_cores(lambda job: self._expected(places, *job), jobs)
+        changed, by_gamma = [log - here for log, _ in found], np.zeros_like(here)
         if seen_by is not None:
             gamma, by_gamma = seen_by[0], changed.pop() / GAMMA_STEP
         slopes = {name: change / LIGHT_STEP for name, change in zip(by, changed, strict=True)}
@@ -247,5 +242,17 @@ class BouncedLight:
         ]
         if gloss is None:
             return Bounce(*columns)
-        surroundings = places.of(self._mirrored(direct, arriving, scaled)) / irradiance
-        return Bounce(*columns, gloss, torch.from_numpy(surroundings.astype(np.float32)))
+        return Bounce(*columns, gloss, torch.from_numpy(surroundings))
+
+    def _expected(
+        self, places: Places, n: float, q: float, log_scale: float, albedo: Albedo, mirrored: bool
+    ) -> tuple[np.ndarray, np.ndarray | None]:
+        """ln of the irradiance of ``places`` [N, 3], and, if it is asked what is ``mirrored`` there, the
+        bounce's ``surroundings``."""
+        albedo = albedo.scaled(log_scale)
+        direct, arriving = self._between(n, q, albedo)
+        irradiance = np.maximum(places.of(arriving[: self._radiosity.count]), DARKEST)
+        if not mirrored:
+            return np.log(irradiance), None
+        surroundings = places.of(self._mirrored(direct, arriving, albedo)) / irradiance
+        return np.log(irradiance), surroundings.astype(np.float32)

@@ -13,6 +13,8 @@ import numpy as np
 from scipy.optimize import nnls
 from scipy.sparse import csr_array
 
+from endotwin.robust import robust_std
+
 HUBER = 1.345
 REWEIGHTS = 5
 DENSE = 8
@@ -95,7 +97,7 @@ def regress(target: np.ndarray, design: Design, categories: int = 0, rounds: int
         found = FixedEffects(solved[:slopes], np.r_[0.0, solved[slopes:]], 0.0)
         left = (target - design.explained(found))[:, None]
         left = np.abs(without_means(left, weight, group, count)[:, 0]) * np.sqrt(trust)
-        width = max(1.4826 * float(np.median(left)), 1e-6) if len(left) else 1e-6
+        width = robust_std(left, 1e-6)
         weight = trust * _held(left, width)
     return FixedEffects(found.coefficients, found.intercepts, width)
 

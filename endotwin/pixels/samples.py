@@ -120,6 +120,11 @@ class Samples:
         return self.views.camera.pixel_directions.reshape(-1, 3)[self.pixel.numpy()]
 
     @property
+    def distance_mm(self) -> float:
+        """Median viewing distance."""
+        return float(np.exp(np.median(self.log_distance.numpy())))
+
+    @property
     def points_mm(self) -> np.ndarray:
         """Surface points in the camera frame, float32 [N, 3]."""
         return self.directions * self.log_distance.exp().numpy()[:, None]

@@ -15,6 +15,7 @@ import numpy as np
 from endotwin.light.forward import Lit, Lobes, shares
 from endotwin.pixels.fixed_effects import HUBER, without_means
 from endotwin.pixels.samples import Samples
+from endotwin.robust import robust_std
 from endotwin.twin import Light, Response
 
 PRIOR = {"n": 2.0, "q": 2.0, "gamma": 1 / 2.2}
@@ -133,7 +134,7 @@ def _coefficients(
         centred = without_means(columns, weight, vertex, count)
         residual = without_means(target, weight, vertex, count)[:, 0] - centred @ prior
         left = np.abs(residual - centred @ change)
-        width = max(1.4826 * np.median(left), 1e-9)
+        width = robust_std(left, 1e-9)
         weight = np.minimum(1, HUBER * width / np.maximum(left, 1e-12))
         weighted = centred * weight[:, None]
         change, told = _told_change(weighted.T @ centred, weighted.T @ residual, width)
