@@ -70,6 +70,10 @@ LEAST = {"interreflection": Verdict(0.1, 3.0), "vignetting": Verdict(0.05, 3.0)}
 where there is none it loses; exponent and profile of the light say nearly the same as vignetting, which can
 gain little, and wrongly on is fitted to none."""
 
+LIKELIER = 2.0
+"""Nats by which a bounce has to make light and response likelier where pixels do not tell, such as those of
+two standard deviations: a gain of each frame can explain what bounces as well, but with another γ."""
+
 
 @dataclass(frozen=True)
 class Decided:
@@ -289,7 +293,8 @@ class _Trial:
         return Surroundings(self._probe)
 
     def _best(self, sets: list[frozenset[str]]) -> frozenset[str]:
-        """The set that predicts held-out pixels best; what no endoscope has counts MIN_IMPOSSIBLE_DB less."""
+        """The set that predicts held-out pixels best, with bounced light where they do not tell, but light
+        and response do; what no endoscope has counts MIN_IMPOSSIBLE_DB less."""
         plain = self._model(sets[0])
 
         def score_db(names: frozenset[str]) -> float:
@@ -297,7 +302,10 @@ class _Trial:
             gain_db = self._probe.compare(plain, model).gain_db
             return gain_db if model.possible else gain_db - MIN_IMPOSSIBLE_DB
 
-        return max(sets, key=score_db)
+        best = max(sets, key=score_db)
+        bounced = best | {"interreflection"}
+        more_usual = bounced in sets and _more_usual(self._verdict(best, bounced))
+        return bounced if more_usual else best
 
     def _pruned(
         self, names: frozenset[str], free: tuple[str, ...] = TOGETHER
@@ -361,6 +369,11 @@ class _Trial:
                 reason = (
                     f"glints stand about guides, and no held-out pixels plainly contradict it ({verdict})"
                 )
+            elif not forced and name == "interreflection" and not verdict.worth(LEAST[name]):
+                reason = (
+                    f"beside it light and response are more usual, and no held-out pixels plainly "
+                    f"contradict it ({verdict})"
+                )
             elif not forced and verdict.gain_db < 0:
                 reason = f"certain beside guides, and no held-out pixels plainly contradict it ({verdict})"
         elif verdict is not None:
@@ -398,4 +411,11 @@ def _first(*guides_mm: Guides) -> Guides:
 
 
 def _worth(name: str, verdict: Verdict) -> bool:
+    if name == "interreflection" and _more_usual(verdict):
+        return True
     return verdict.worth(LEAST[name]) if name in LEAST else verdict.keep
+
+
+def _more_usual(verdict: Verdict) -> bool:
+    """Whether light and response say that light bounces, and no pixels plainly contradict it."""
+    return verdict.likelier >= LIKELIER and not verdict.contradicts

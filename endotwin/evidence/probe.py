@@ -93,11 +93,13 @@ class Hypothesis:
 @dataclass(frozen=True)
 class Verdict:
     """By how much one hypothesis predicts unseen pixels better than another: dB, and in its own sigmas; and
-    whether light and response of the better one are any endoscope's, or the other's neither."""
+    whether light and response of the better one are any endoscope's, or the other's neither, and how much
+    likelier than the other's they were before any photo was seen, in nats."""
 
     gain_db: float
     sigmas: float
     possible: bool = True
+    likelier: float = 0.0
 
     @property
     def keep(self) -> bool:
@@ -177,6 +179,12 @@ class Fitted:
         return all(low < value < high for value, (low, high) in zip((self.n, self.q), bounds, strict=True))
 
     @property
+    def unusual(self) -> float:
+        """How unlikely its light and response are by their prior, in nats from its mean."""
+        off = (self.effects.coefficients[:3] - LIGHT_MEAN) / LIGHT_SPREAD
+        return float(off @ off) / 2
+
+    @property
     def start(self) -> tuple[float, float, float]:
         """n, q and γ to start a fit from: those of the priors, where its own are no endoscope's."""
         return (self.n, self.q, self.gamma) if self.possible else (PRIOR["n"], PRIOR["q"], PRIOR["gamma"])
@@ -240,7 +248,8 @@ class Probe(Sightings):
     def compare(self, base: Fitted, other: Fitted) -> Verdict:
         """How much better ``other`` predicts pixels of vertices that did not choose its coefficients."""
         verdict = compared(base.halved, other.halved, base.effects.width)
-        return replace(verdict, possible=other.possible or not base.possible)
+        possible = other.possible or not base.possible
+        return replace(verdict, possible=possible, likelier=base.unusual - other.unusual)
 
     def shaded_db(self, found: Fitted) -> float:
         """By how much the mean square of what ``found`` leaves would grow if nothing explained the shadows

@@ -16,12 +16,12 @@ from endotwin.effects.vignetting import Vignetting
 from endotwin.evidence.decide import _Trial, decide
 from endotwin.evidence.glints import Glints
 from endotwin.evidence.guide_search import Ground, found_guides
-from endotwin.evidence.probe import Hypothesis, Probe
+from endotwin.evidence.probe import Hypothesis, Probe, Verdict
 from endotwin.light.guides import AT_LENS
 from endotwin.pipeline import fuse_twin
 from endotwin.pixels.pace import Pace
 from endotwin.pixels.samples import gather
-from endotwin.pixels.start import closed_form
+from endotwin.pixels.start import LIGHT_MEAN, LIGHT_SPREAD, closed_form
 from endotwin.surface.casting import Caster
 
 pytestmark = pytest.mark.slow
@@ -258,6 +258,36 @@ def test_shadows_are_cast_by_guides_unless_hardly_a_pixel_lies_in_one_or_many_co
     assert state(samples, GUIDES_MM) == "on" and state(few, GUIDES_MM) == "on"
     assert state(samples, np.multiply(GUIDES_MM, [0.01, 0.01, 1])) == "off"
     assert state(samples, np.multiply(GUIDES_MM, 3)) == "off"
+
+
+@pytest.mark.parametrize(
+    ("gain_db", "likelier", "state"),
+    [(-0.05, 2.7, "on"), (-0.05, 1.0, "off"), (-0.5, 2.7, "off"), (0.15, -1.0, "on")],
+)
+def test_a_bounce_that_gains_make_up_for_is_told_by_how_usual_light_and_response_are_beside_it(
+    example, monkeypatch, gain_db, likelier, state
+):
+    twin, caster, samples, glints = example
+
+    def compared(probe, base, other) -> Verdict:
+        more = (other.hypothesis.bounced is not None) - (base.hypothesis.bounced is not None)
+        return Verdict(more * gain_db, more * np.sign(gain_db) * 5, likelier=more * likelier)
+
+    monkeypatch.setattr(Probe, "compare", compared)
+    wanted = {name: "off" for name in LIGHT if name != "interreflection"}
+    trial = _Trial(Probe(samples, twin, caster), glints, wanted, lambda: False, AT_LENS)
+    trial.together()
+    assert trial._decisions["interreflection"].state == state
+
+
+def test_light_and_response_are_as_unusual_as_they_are_far_from_what_is_usual(example):
+    twin, caster, samples, _ = example
+    found = Probe(samples, twin, caster).fit(Hypothesis())
+    mean, spread = np.array(LIGHT_MEAN), np.array(LIGHT_SPREAD)
+    for off, nats in (([0, 0, 0], 0.0), ([0, 0, 2], 2.0), ([1, -1, 1], 1.5)):
+        coefficients = np.r_[mean + off * spread, found.effects.coefficients[3:]]
+        moved = replace(found, effects=replace(found.effects, coefficients=coefficients))
+        assert moved.unusual == pytest.approx(nats)
 
 
 @needs_data
