@@ -371,8 +371,7 @@ class _Trial:
                 )
             elif not forced and name == "interreflection" and not verdict.worth(LEAST[name]):
                 reason = (
-                    f"beside it light and response are more usual, and no held-out pixels plainly "
-                    f"contradict it ({verdict})"
+                    f"beside it light and response are more usual; held-out pixels hardly tell ({verdict})"
                 )
             elif not forced and verdict.gain_db < 0:
                 reason = f"certain beside guides, and no held-out pixels plainly contradict it ({verdict})"
@@ -417,5 +416,5 @@ def _worth(name: str, verdict: Verdict) -> bool:
 
 
 def _more_usual(verdict: Verdict) -> bool:
-    """Whether light and response say that light bounces, and no pixels plainly contradict it."""
-    return verdict.likelier >= LIKELIER and not verdict.contradicts
+    """Whether light and response say that light bounces, and pixels hardly say anything else."""
+    return verdict.likelier >= LIKELIER and verdict.gain_db > -MIN_GAIN_DB

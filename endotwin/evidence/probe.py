@@ -94,7 +94,7 @@ class Hypothesis:
 class Verdict:
     """By how much one hypothesis predicts unseen pixels better than another: dB, and in its own sigmas; and
     whether light and response of the better one are any endoscope's, or the other's neither, and how much
-    likelier than the other's they were before any photo was seen, in nats."""
+    likelier than the other's they were before any photo was seen, in nats, if they are any endoscope's."""
 
     gain_db: float
     sigmas: float
@@ -249,7 +249,8 @@ class Probe(Sightings):
         """How much better ``other`` predicts pixels of vertices that did not choose its coefficients."""
         verdict = compared(base.halved, other.halved, base.effects.width)
         possible = other.possible or not base.possible
-        return replace(verdict, possible=possible, likelier=base.unusual - other.unusual)
+        likelier = base.unusual - other.unusual if other.possible else 0.0
+        return replace(verdict, possible=possible, likelier=likelier)
 
     def shaded_db(self, found: Fitted) -> float:
         """By how much the mean square of what ``found`` leaves would grow if nothing explained the shadows

@@ -290,6 +290,21 @@ def test_light_and_response_are_as_unusual_as_they_are_far_from_what_is_usual(ex
         assert moved.unusual == pytest.approx(nats)
 
 
+def test_no_light_is_likelier_that_no_endoscope_has(example):
+    twin, caster, samples, _ = example
+    probe = Probe(samples, twin, caster)
+    found = probe.fit(Hypothesis())
+
+    def with_gamma(gamma: float):
+        coefficients = found.effects.coefficients.copy()
+        coefficients[2] = gamma
+        return replace(found, effects=replace(found.effects, coefficients=coefficients))
+
+    unusual, *odd = map(with_gamma, (0.2, -0.6, -0.3))
+    assert probe.compare(unusual, found).likelier > 2
+    assert probe.compare(*odd).likelier == 0 < odd[0].unusual - odd[1].unusual
+
+
 @needs_data
 def test_vignetting_and_guides_are_told_apart(lit_from_beside):
     twin, caster, samples, glints = lit_from_beside
