@@ -222,7 +222,6 @@ class BouncedLight:
         albedo that photos tell of with γ + GAMMA_STEP; None: whatever γ, the albedo is the same. ``by``:
         those of BOUNCES_BY that are to change; each of them takes its time.
         """
-
         about, gamma = np.array([n, q, log_scale]), 0.0
         moved = [(*(about + LIGHT_STEP * (np.array(BOUNCES_BY) == name)), albedo) for name in by]
         if seen_by is not None:
