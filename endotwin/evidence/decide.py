@@ -65,10 +65,10 @@ changes it by tens."""
 SHOWN_GAIN = LEVEL / PRIOR["gamma"]
 """Standard deviation of ln gain that changes white by one of 255 levels: a smaller one no photo shows."""
 
-LEAST = {"interreflection": Verdict(0.1, 3.0), "vignetting": Verdict(0.05, 3.0)}
-"""What an effect has to gain where the usual is too much: bounced light has no coefficient of its own, and
-where there is none it loses; exponent and profile of the light say nearly the same as vignetting, which can
-gain little, and wrongly on is fitted to none."""
+LEAST, LITTLE = Verdict(0.05, 3.0), ("interreflection", "vignetting")
+"""What the LITTLE have to gain, of which the usual is too much: bounced light has no coefficient of its own, so
+that where there is none it loses, and where there is it shows most where light grazes and pixels count least;
+exponent and profile of the light say nearly the same as vignetting, and wrongly on it is fitted to none."""
 
 LIKELIER = 2.0
 """Nats by which a bounce has to make light and response likelier where pixels do not tell, such as those of
@@ -369,7 +369,7 @@ class _Trial:
                 reason = (
                     f"glints stand about guides, and no held-out pixels plainly contradict it ({verdict})"
                 )
-            elif not forced and name == "interreflection" and not verdict.worth(LEAST[name]):
+            elif not forced and name == "interreflection" and not verdict.worth(LEAST):
                 reason = (
                     f"beside it light and response are more usual; held-out pixels hardly tell ({verdict})"
                 )
@@ -412,7 +412,7 @@ def _first(*guides_mm: Guides) -> Guides:
 def _worth(name: str, verdict: Verdict) -> bool:
     if name == "interreflection" and _more_usual(verdict):
         return True
-    return verdict.worth(LEAST[name]) if name in LEAST else verdict.keep
+    return verdict.worth(LEAST) if name in LITTLE else verdict.keep
 
 
 def _more_usual(verdict: Verdict) -> bool:

@@ -33,7 +33,7 @@ from endotwin.pixels.fixed_effects import (
     robust_losses,
 )
 from endotwin.pixels.samples import Samples, whole_groups
-from endotwin.pixels.start import LIGHT_MEAN, LIGHT_SPREAD, PRIOR, dark, diffuse
+from endotwin.pixels.start import LIGHT_MEAN, LIGHT_SPREAD, PRIOR, dark, diffuse, trust
 
 if TYPE_CHECKING:
     from endotwin.surface.casting import Caster
@@ -73,6 +73,9 @@ POSSIBLE = ((0.1, 2.0), (-1.0, 12.0), (-0.5, 7.0))
 
 LEAST_GAMMA = 0.05
 """Less is found where photos tell nothing: a model is not linearised about that."""
+
+LEAST_COS = 0.02
+"""By so much normals err: what turns no more to any guide, and shows light, turns so much to it."""
 
 HINT_DB, HINT_SIGMAS = 0.1, 2.0
 """What is worth a longer look, which then has to be worth keeping."""
@@ -283,7 +286,7 @@ class Probe(Sightings):
         frame = np.searchsorted(self.frames, sightings.samples.frame.numpy())
         design = Design(columns, sightings.vertex, self.count, frame if hypothesis.gain else None)
         shown = np.exp(design.explained(found.effects) + self._intercepts(found)[sightings.vertex])
-        return shown * sightings.lit(hypothesis.guides_mm) if hypothesis.shadows else shown
+        return shown * sightings.lit(hypothesis.guides_mm, hypothesis.shadows)
 
     def _intercepts(self, found: Fitted) -> np.ndarray:
         """What is left of ln C at each vertex, [count]."""
@@ -309,6 +312,7 @@ class Probe(Sightings):
             self.vertex,
             self.count,
             self.frame if hypothesis.gain else None,
+            trust(self.samples.cos.numpy().astype(np.float64)),
             prior=(np.diag(precision), precision * mean),
         )
 
@@ -323,8 +327,8 @@ def log_light(sightings: Sightings, hypothesis: Hypothesis, visible: np.ndarray 
     """The light of a hypothesis at sightings that its guides see as ``visible`` [N, K] says (found out unless
     given).
 
-    What shows light is lit, whatever the surface says: no pixel is taken to lie in all guides' shadow where
-    nothing else would light it.
+    What shows light is lit, whatever the surface says: no pixel is taken to lie in all guides' shadow, or to
+    turn away from all of them, where nothing else would light it.
     """
     samples = sightings.samples
     if hypothesis.guides_mm == AT_LENS:
@@ -339,6 +343,9 @@ def log_light(sightings: Sightings, hypothesis: Hypothesis, visible: np.ndarray 
     if hypothesis.shadows and hypothesis.bounced is None:
         visible = visible | ~visible.any(axis=1, keepdims=True)
     lit = guided(sightings.points_mm, sightings.normals, guides_mm, hypothesis.profile, visible)
+    if hypothesis.bounced is None:
+        away = lit.cos_i.amax(dim=1, keepdim=True) < LEAST_COS
+        lit = replace(lit, cos_i=torch.where(away, LEAST_COS, lit.cos_i))
     return LogLight(Lit(samples.cos, lit), hypothesis.bounced)
 
 

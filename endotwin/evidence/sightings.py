@@ -78,9 +78,12 @@ class Sightings:
         """Bool [N, K]: which of guides [K, 3] see each pixel's point."""
         return np.stack([self.visible(guide) for guide in np.asarray(guides_mm, np.float32)], axis=1)
 
-    def lit(self, guides_mm: np.ndarray) -> np.ndarray:
-        """Bool [N]: whether any of guides [K, 3] sees each pixel's point."""
-        return self.visible_to(guides_mm).any(axis=1)
+    def lit(self, guides_mm: np.ndarray, shadows: bool) -> np.ndarray:
+        """Bool [N]: whether any of guides [K, 3] lies before each point's surface and, with ``shadows``, is
+        seen from there."""
+        towards = np.asarray(guides_mm, np.float32) - self.points_mm[:, None]
+        before = np.einsum("nka,na->nk", towards, self.normals) > 0
+        return (before & self.visible_to(guides_mm) if shadows else before).any(axis=1)
 
     @cached_property
     def shown(self) -> np.ndarray:

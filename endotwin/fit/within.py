@@ -37,7 +37,7 @@ from endotwin.fit.state import bounded, roughness_slope
 from endotwin.light import shading
 from endotwin.pixels.fixed_effects import Design, regress
 from endotwin.pixels.samples import Samples
-from endotwin.pixels.start import BRIGHT, DARK, DIFFUSE_SIN2
+from endotwin.pixels.start import BRIGHT, DARK, DIFFUSE_SIN2, trust
 from endotwin.surface import Surface
 
 LEVEL, SCALE = (BOUNCE_GLOBALS.index(name) for name in ("gamma·ln L0", "ln albedo scale"))
@@ -46,7 +46,8 @@ DARKEST = 0.03
 """Display value of the prediction below which noise rules the logarithm."""
 
 MODEL_ERROR = 0.02
-"""Relative error of a prediction whose noise is 0: normals, albedo within a vertex's cell."""
+"""Relative error of a prediction whose noise is 0, where light meets tissue head-on: distances, albedo within
+a vertex's cell."""
 
 RATIO_ERROR = 0.004
 """That of a ratio of channels: what a normal or a distance errs by is alike in all of them."""
@@ -213,6 +214,8 @@ class Within:
         if shared.bounces:
             passing.append(model.by_globals[bright][..., SCALE])
 
+        alike = np.full(len(rows), RATIO_ERROR)
+
         def without(tone: Tone) -> Hues:
             steep, found = predicted * tone.slope(predicted), []
             untoned = torch.log(torch.from_numpy(tone.undone(shown)) / predicted)
@@ -220,7 +223,7 @@ class Within:
             for number, ratio in enumerate(RATIOS):
                 variance = ((noise / steep) ** 2 @ ratio**2).numpy()
                 columns = tuple((x @ ratio).numpy() for x in relative)
-                place, _, *means, weight = self._means(rows, columns, variance, RATIO_ERROR)
+                place, _, *means, weight = self._means(rows, columns, variance, alike)
                 found.append((place + number * self.count, means[0], np.stack(means[1:], axis=1), weight))
             return Hues(*map(np.concatenate, zip(*found, strict=True)))
 
@@ -328,23 +331,25 @@ class Within:
         by_raw = roughness_slope(material[rows, 3])[:, None]
         by_roughness = (model.by_roughness[bright] * by_raw * tells).mean(dim=1).numpy() / predicted
         columns = (residual, by_roughness, by_coat, *slopes.T, *by_guides, *by_faint)
-        vertex, frame, *means, weight = self._means(rows, columns, (noise / predicted) ** 2, MODEL_ERROR)
+        error = MODEL_ERROR / np.sqrt(trust(self.samples.cos[rows].numpy()))
+        vertex, frame, *means, weight = self._means(rows, columns, (noise / predicted) ** 2, error)
         by_shared, by_varied = np.split(np.stack(means[3:], axis=1), [slopes.shape[1]], axis=1)
         return Sightings(vertex, frame, means[0], by_shared, *means[1:3], by_varied, weight)
 
     def _means(
-        self, rows: Tensor, columns: tuple[np.ndarray, ...], variance: np.ndarray, error: float
+        self, rows: Tensor, columns: tuple[np.ndarray, ...], variance: np.ndarray, error: np.ndarray
     ) -> list[np.ndarray]:
         """Vertex, frame, means of the ``columns`` and their inverse variance of what the samples ``rows`` [R]
         show of a vertex in one photo, each [S].
 
-        Noise of ``variance`` [R] is each pixel's own, the model's ``error`` that of all.
+        Noise of ``variance`` [R] is each pixel's own; what the model errs by, ``error`` [R], all have alike.
         """
         place = self.vertex[rows.numpy()].astype(np.int64) << 32 | self.samples.frame[rows].numpy()
         place, which = np.unique(place, return_inverse=True)
         total = np.bincount(which, 1 / variance, len(place))
         means = [np.bincount(which, column / variance, len(place)) / total for column in columns]
-        weight = 1 / (1 / total + error**2)
+        alike = np.bincount(which, error**2, len(place)) / np.bincount(which, minlength=len(place))
+        weight = 1 / (1 / total + alike)
         return [place >> 32, (place & 0xFFFFFFFF).astype(np.int32), *means, weight]
 
     def _by_guides(

@@ -10,9 +10,10 @@ import torch
 from independent.light import burley, ggx
 
 from endotwin.config import STANDARD
+from endotwin.evidence.bounce import Surroundings
 from endotwin.evidence.decide import LEAST
 from endotwin.evidence.light_map import LightMap, places_mm
-from endotwin.evidence.probe import Hypothesis, Probe
+from endotwin.evidence.probe import LEAST_COS, Hypothesis, Probe, log_light
 from endotwin.evidence.sightings import Sightings
 from endotwin.pipeline import fuse_twin
 from endotwin.pixels.pace import Pace
@@ -60,7 +61,7 @@ def test_a_rough_lobe_bends_no_light_and_passes_for_no_other_effect(example, rou
     assert plain.tissue.roughness == pytest.approx(roughness, abs=0.1)
     others = (Hypothesis(gain=True), Hypothesis(profile=1.0), BESIDE)
     assert not any(probe.compare(plain, probe.fit(each)).keep for each in others)
-    assert not probe.compare(plain, probe.fit(Hypothesis(vignetting=True))).worth(LEAST["vignetting"])
+    assert not probe.compare(plain, probe.fit(Hypothesis(vignetting=True))).worth(LEAST)
 
 
 @pytest.mark.parametrize(
@@ -109,14 +110,27 @@ def test_a_map_of_the_light_is_one_whatever_the_photos_show(example, spread):
 
 
 def test_a_pixel_that_shows_light_is_not_taken_to_lie_in_full_shadow(example):
-    assert not example.lit(BESIDE.guides_mm).all()
+    assert not example.lit(BESIDE.guides_mm, shadows=True).all()
     cast, uncast = example.fit(BESIDE), example.fit(replace(BESIDE, shadows=False))
     np.testing.assert_array_equal(cast.design.columns, uncast.design.columns)
 
 
+def test_what_shows_light_is_not_taken_to_turn_away_from_it_unless_other_tissue_lights_it(example):
+    far = Hypothesis(guides_mm=((60.0, 0.0, 0.0),))
+    towards = np.array(far.guides_mm) - example.points_mm
+    cos = (towards * example.normals).sum(axis=1) / np.linalg.norm(towards, axis=1)
+    away = cos < 0
+    assert away.any() and not away.all()
+    np.testing.assert_array_equal(example.lit(far.guides_mm, shadows=False), ~away)
+    alone = log_light(example, far)
+    np.testing.assert_allclose(alone.lit.guides.cos_i[:, 0], np.maximum(cos, LEAST_COS), atol=1e-6)
+    among = log_light(example, replace(far, bounced=Surroundings(example).bounced(far)))
+    np.testing.assert_allclose(among.lit.guides.cos_i[:, 0], np.maximum(cos, 0), atol=1e-6)
+
+
 def test_shadows_are_told_by_pixels_that_show_no_light(example):
     cast, uncast = example.fit(BESIDE), example.fit(replace(BESIDE, shadows=False))
-    hidden = ~example.lit(BESIDE.guides_mm)
+    hidden = ~example.lit(BESIDE.guides_mm, shadows=True)
     samples = example.samples[torch.from_numpy(np.flatnonzero(hidden))]
     black = replace(samples, color=torch.zeros_like(samples.color))
     probe = copy.copy(example)
