@@ -14,7 +14,7 @@ from scipy.stats import chi2
 
 from endotwin.effects import Decision
 from endotwin.effects.coat import Coat
-from endotwin.evidence.probe import Halved, Verdict, verdict_of
+from endotwin.evidence.verdict import Halved, Verdict, verdict_of
 from endotwin.pixels.fixed_effects import Design, regress, robust_losses
 
 ROUGHNESSES = (0.045, 0.06, 0.09, 0.13, 0.19, 0.27)

@@ -28,26 +28,11 @@ from endotwin.effects.specular import Specular
 from endotwin.effects.vignetting import Vignetting
 from endotwin.evidence.bounce import Surroundings, cell_mm
 from endotwin.evidence.glints import Glints
-from endotwin.evidence.guide_search import (
-    BARE,
-    Ground,
-    Guides,
-    Search,
-    found_guides,
-    polished,
-    settled,
-    worth,
-)
+from endotwin.evidence.guide_search import Ground, Guides, Search, found_guides, polished, settled
 from endotwin.evidence.log_light import Bounced
-from endotwin.evidence.probe import (
-    MIN_GAIN_DB,
-    MIN_IMPOSSIBLE_DB,
-    MIN_SIGMAS,
-    Fitted,
-    Hypothesis,
-    Probe,
-    Verdict,
-)
+from endotwin.evidence.probe import Fitted, Hypothesis, Probe
+from endotwin.evidence.verdict import MIN_GAIN_DB, MIN_IMPOSSIBLE_DB, MIN_SIGMAS, Verdict
+from endotwin.evidence.worth import BARE, LEAST, more_usual, worth
 from endotwin.light.guides import AT_LENS, COSINE, EXPONENTIAL
 from endotwin.pixels.samples import Samples
 from endotwin.pixels.start import PRIOR
@@ -57,22 +42,8 @@ from endotwin.twin import Twin
 TOGETHER = ("offset", "interreflection", "gain")
 BESIDE = ("profile", "vignetting")
 
-LEAST_GAIN, PLAIN_DB = 0.08, 3.0
-"""Standard deviation of ln gain below which, beside bounced light, it is none, unless it leaves half of the
-loss: the bounce from a mesh of what was seen errs by some 4 % of a frame's brightness. An automatic gain
-changes it by tens."""
-
 SHOWN_GAIN = LEVEL / PRIOR["gamma"]
 """Standard deviation of ln gain that changes white by one of 255 levels: a smaller one no photo shows."""
-
-LEAST, LITTLE = Verdict(0.05, 3.0), ("interreflection", "vignetting")
-"""What the LITTLE have to gain, of which the usual is too much: bounced light has no coefficient of its own, so
-that where there is none it loses, and where there is it shows most where light grazes and pixels count least;
-exponent and profile of the light say nearly the same as vignetting, and wrongly on it is fitted to none."""
-
-LIKELIER = 2.0
-"""Nats by which a bounce has to make light and response likelier where pixels do not tell, such as those of
-two standard deviations: a gain of each frame can explain what bounces as well, but with another γ."""
 
 
 @dataclass(frozen=True)
@@ -217,11 +188,11 @@ class _Trial:
         other = self._mixed(kept) if name == "profile" else replace(kept.hypothesis, vignetting=True)
         other = self._probe.fit(other)
         verdict = self._verdict_beside(name, kept, other)
-        on = self.wanted(name) == "on" or _worth(name, verdict)
+        on = self.wanted(name) == "on" or worth(name, verdict, other)
         if on and other.hypothesis.guides_mm != AT_LENS:
             kept, other = settled(self._ground, kept), settled(self._ground, other)
             verdict = self._verdict_beside(name, kept, other)
-            on = self.wanted(name) == "on" or _worth(name, verdict)
+            on = self.wanted(name) == "on" or worth(name, verdict, other)
         self._say(name, on, verdict)
         self._seconds[name] += time.perf_counter() - began
         return other if on else kept
@@ -304,8 +275,8 @@ class _Trial:
 
         best = max(sets, key=score_db)
         bounced = best | {"interreflection"}
-        more_usual = bounced in sets and _more_usual(self._verdict(best, bounced))
-        return bounced if more_usual else best
+        likelier = bounced in sets and more_usual(self._verdict(best, bounced))
+        return bounced if likelier else best
 
     def _pruned(
         self, names: frozenset[str], free: tuple[str, ...] = TOGETHER
@@ -322,12 +293,8 @@ class _Trial:
             names = names - {min(unworthy, key=lambda name: verdicts[name].gain_db)}
 
     def _worth_within(self, names: frozenset[str], name: str, verdict: Verdict) -> bool:
-        if name == "offset":
-            model = self._model(names)
-            return worth(verdict, model.hypothesis) or self._ground.certain(model, verdict)
-        told = name != "gain" or "interreflection" not in names or verdict.gain_db >= PLAIN_DB
-        told = told or float(self._model(names).log_gain.std()) >= LEAST_GAIN
-        return told and _worth(name, verdict)
+        model = self._model(names)
+        return worth(name, verdict, model) or (name == "offset" and self._ground.certain(model, verdict))
 
     def _verdict(self, without: frozenset[str], names: frozenset[str]) -> Verdict:
         return self._probe.compare(self._model(without), self._model(names))
@@ -407,14 +374,3 @@ class _Trial:
 def _first(*guides_mm: Guides) -> Guides:
     """The first that is not at the lens, if any."""
     return next((each for each in guides_mm if each != AT_LENS), AT_LENS)
-
-
-def _worth(name: str, verdict: Verdict) -> bool:
-    if name == "interreflection" and _more_usual(verdict):
-        return True
-    return verdict.worth(LEAST) if name in LITTLE else verdict.keep
-
-
-def _more_usual(verdict: Verdict) -> bool:
-    """Whether light and response say that light bounces, and pixels hardly say anything else."""
-    return verdict.likelier >= LIKELIER and verdict.gain_db > -MIN_GAIN_DB

@@ -10,7 +10,9 @@ from scipy.optimize import least_squares
 
 from endotwin.evidence.glints import MOST_GUIDES, Glints
 from endotwin.evidence.light_map import LightMap, places_mm
-from endotwin.evidence.probe import Fitted, Hypothesis, Probe, Verdict
+from endotwin.evidence.probe import Fitted, Hypothesis, Probe
+from endotwin.evidence.verdict import Verdict
+from endotwin.evidence.worth import hints_at_guides, worth
 from endotwin.light.guides import AT_LENS
 from endotwin.pixels.fixed_effects import Design, Left
 
@@ -29,11 +31,6 @@ STEPS, TOLERANCE = 12, 1e-3
 
 SEEN_GUIDES = 64
 """What so many guides see is kept: of several one is moved at a time."""
-
-BARE, BARE_HINT = Verdict(0.05, 5.0), Verdict(0.025, 2.0)
-"""What guides have to gain where no light bounces, and what is worth a search: the rest of the model is right
-to a percent there, and where the light is at the lens guides gain nothing. A bounce errs by more, for which
-they make up."""
 
 DEEPEST = 1.0
 """Of the radius: guides lie at most so far behind the lens."""
@@ -91,11 +88,6 @@ class Ground:
         return replace(hypothesis, bounced=hypothesis.bounced[self._rows])
 
 
-def worth(verdict: Verdict, beside: Hypothesis) -> bool:
-    """Whether guides ``beside`` other effects are worth their place."""
-    return verdict.keep or (beside.bounced is None and verdict.worth(BARE))
-
-
 def found_guides(ground: Ground, base: Hypothesis, forced: bool, near_mm: Guides = AT_LENS) -> Guides:
     """Positions of one to three guides that predict held-out pixels better than ``base``, camera frame; the
     lens where none do, and glints tell of none. They are sought where they explain the glints as well, and
@@ -114,7 +106,7 @@ def found_guides(ground: Ground, base: Hypothesis, forced: bool, near_mm: Guides
     if near_mm != AT_LENS:
         near = replace(base, guides_mm=near_mm, shadows=True)
         near = under(Search(ground.part, near).settled())
-        if worth(probe.compare(plain, near), base):
+        if worth("offset", probe.compare(plain, near), near):
             return near.hypothesis.guides_mm
     search, told = Search(ground.part, base), ground.glints.told()
     if not (forced or told or search.hints()):
@@ -125,9 +117,9 @@ def found_guides(ground: Ground, base: Hypothesis, forced: bool, near_mm: Guides
             best, first = found, told + 1
     for number in range(first, MOST_GUIDES + 1):
         found = under(search.best(number))
-        better = worth(probe.compare(best or plain, found), base)
+        better = worth("offset", probe.compare(best or plain, found), found)
         if better and best is not None:
-            better = worth(probe.compare(settled(ground, best), found), base)
+            better = worth("offset", probe.compare(settled(ground, best), found), found)
         if better or (forced and best is None and number == MOST_GUIDES):
             best = found
     return AT_LENS if best is None else Search(ground.part, best.hypothesis).settled()
@@ -166,9 +158,7 @@ class Search:
         """Whether one guide, wherever it is best, or two or three where light gathers predict better."""
         more = [start for number in range(2, MOST_GUIDES + 1) for start in self._starts(number)]
         models = [self._probe.fit(self._with(each)) for each in (self.best(1), *more)]
-        verdicts = [self._probe.compare(self._base, model) for model in models]
-        bare = self._base.hypothesis.bounced is None
-        return any(each.worth(BARE_HINT) if bare else each.hints for each in verdicts)
+        return any(hints_at_guides(self._probe.compare(self._base, model), model) for model in models)
 
     def _best(self, number: int) -> Guides:
         """The best positions of so many guides."""

@@ -17,7 +17,7 @@ import numpy as np
 from endotwin.effects import Decision
 from endotwin.effects.tone import Tone
 from endotwin.evidence.coat import LEAST_SIGHTINGS
-from endotwin.evidence.probe import MIN_SIGMAS, Halved, Verdict, compared
+from endotwin.evidence.verdict import MIN_SIGMAS, Halved, Verdict, compared
 from endotwin.pixels.fixed_effects import Design, regress
 
 ROUNDS, SETTLED = 4, 0.002

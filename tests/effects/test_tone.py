@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 
 from endotwin.effects.tone import Tone, bend
 from endotwin.evidence import tone as evidence
-from endotwin.evidence.probe import Verdict
 from endotwin.evidence.tone import LEAST_CONTRAST, Hues, judged, steadied
+from endotwin.evidence.verdict import Verdict
 
 CONTRASTS = st.floats(0, 0.9)
 RAMP = torch.linspace(0, 1.3, 1301, dtype=torch.float64)

@@ -16,7 +16,8 @@ from endotwin.effects.vignetting import Vignetting
 from endotwin.evidence.decide import _Trial, decide
 from endotwin.evidence.glints import Glints
 from endotwin.evidence.guide_search import Ground, found_guides
-from endotwin.evidence.probe import Hypothesis, Probe, Verdict
+from endotwin.evidence.probe import Hypothesis, Probe
+from endotwin.evidence.verdict import Verdict
 from endotwin.light.guides import AT_LENS
 from endotwin.pipeline import fuse_twin
 from endotwin.pixels.pace import Pace

@@ -11,10 +11,10 @@ from independent.light import burley, ggx
 
 from endotwin.config import STANDARD
 from endotwin.evidence.bounce import Surroundings
-from endotwin.evidence.decide import LEAST
 from endotwin.evidence.light_map import LightMap, places_mm
 from endotwin.evidence.probe import LEAST_COS, Hypothesis, Probe, log_light
 from endotwin.evidence.sightings import Sightings
+from endotwin.evidence.worth import LEAST
 from endotwin.pipeline import fuse_twin
 from endotwin.pixels.pace import Pace
 from endotwin.pixels.samples import gather

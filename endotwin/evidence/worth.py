@@ -1,0 +1,50 @@
+"""What an effect of the light has to gain to be worth its place.
+
+For most that is what a verdict asks to ``keep`` it. An effect that is not there gains, too: it explains some
+of what the rest of the model errs by, which is more where light bounces.
+"""
+
+from __future__ import annotations
+
+from endotwin.evidence.probe import Fitted
+from endotwin.evidence.verdict import MIN_GAIN_DB, Verdict
+
+LEAST = Verdict(0.05, 3.0)
+"""What is enough for two effects. Bounced light has no coefficient of its own, so that where there is none it
+loses, and where there is it shows most where light grazes and pixels count least. Exponent and profile of the
+light say nearly the same as vignetting, and wrongly on it is fitted to none."""
+
+BARE, BARE_HINT = Verdict(0.05, 5.0), Verdict(0.025, 2.0)
+"""What guides have to gain where no light bounces, and what is worth a search: the rest of the model is right
+to a percent there, and where the light is at the lens guides gain nothing. A bounce errs by more, for which
+they make up."""
+
+LEAST_GAIN, PLAIN_DB = 0.08, 3.0
+"""Standard deviation of ln gain below which, beside bounced light, it is none, unless it leaves half of the
+loss: the bounce from a mesh of what was seen errs by some 4 % of a frame's brightness. An automatic gain
+changes it by tens."""
+
+LIKELIER = 2.0
+"""Nats by which a bounce has to make light and response likelier where pixels do not tell, such as those of
+two standard deviations: a gain of each frame can explain what bounces as well, but with another γ."""
+
+
+def worth(name: str, verdict: Verdict, model: Fitted) -> bool:
+    """Whether the effect ``name`` of ``model`` is worth its place by the ``verdict`` on that beside the same
+    without it."""
+    bounces = model.hypothesis.bounced is not None
+    if name == "gain" and bounces and verdict.gain_db < PLAIN_DB:
+        return verdict.keep and float(model.log_gain.std()) >= LEAST_GAIN
+    if name in ("interreflection", "vignetting"):
+        return verdict.worth(LEAST) or (name == "interreflection" and more_usual(verdict))
+    return verdict.keep or (name == "offset" and not bounces and verdict.worth(BARE))
+
+
+def more_usual(verdict: Verdict) -> bool:
+    """Whether light and response say that light bounces, and pixels hardly say anything else."""
+    return verdict.likelier >= LIKELIER and verdict.gain_db > -MIN_GAIN_DB
+
+
+def hints_at_guides(verdict: Verdict, model: Fitted) -> bool:
+    """Whether the guides of ``model`` are worth a longer search by the ``verdict`` on it beside none."""
+    return verdict.hints if model.hypothesis.bounced is not None else verdict.worth(BARE_HINT)

@@ -1,0 +1,42 @@
+"""An effect is worth its place by more where the rest of the model errs by more."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from endotwin.evidence.probe import Hypothesis
+from endotwin.evidence.verdict import Verdict
+from endotwin.evidence.worth import worth
+
+
+def model(bounces: bool, varies: float = 0.0) -> SimpleNamespace:
+    """What is asked of a fitted model: whether light bounces, and ln of two frames' gains."""
+    hypothesis = Hypothesis(bounced=object() if bounces else None)
+    return SimpleNamespace(hypothesis=hypothesis, log_gain=varies * np.array([-1.0, 1.0]))
+
+
+def test_guides_that_gain_little_are_worth_their_place_only_where_no_light_bounces():
+    little, usual = Verdict(0.06, 6), Verdict(0.25, 4)
+    assert worth("offset", little, model(bounces=False)) and not worth("offset", little, model(bounces=True))
+    assert worth("offset", usual, model(bounces=True))
+
+
+def test_beside_a_bounce_a_gain_has_to_vary_as_a_cameras_does_or_to_explain_half_of_all():
+    usual, plain = Verdict(0.5, 10), Verdict(3.5, 10)
+    assert worth("gain", usual, model(bounces=False, varies=0.02))
+    assert not worth("gain", usual, model(bounces=True, varies=0.02))
+    assert worth("gain", usual, model(bounces=True, varies=0.1))
+    assert worth("gain", plain, model(bounces=True, varies=0.02))
+
+
+def test_a_bounce_that_pixels_hardly_tell_is_told_by_a_light_that_is_likelier():
+    assert worth("interreflection", Verdict(-0.1, -2, likelier=2.5), model(bounces=True))
+    assert not worth("interreflection", Verdict(-0.1, -2, likelier=1.5), model(bounces=True))
+    assert not worth("interreflection", Verdict(-0.3, -2, likelier=2.5), model(bounces=True))
+
+
+@pytest.mark.parametrize("name", ["interreflection", "vignetting", "profile", "offset", "gain"])
+def test_with_a_light_that_no_endoscope_has_every_effect_has_to_gain_plainly(name):
+    assert not worth(name, Verdict(1.0, 20, possible=False), model(bounces=False))
+    assert worth(name, Verdict(3.1, 20, possible=False), model(bounces=False))
