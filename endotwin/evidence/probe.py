@@ -27,7 +27,7 @@ from endotwin.light.forward import Lit
 from endotwin.light.guides import AT_LENS, COSINE, guided, log_axis
 from endotwin.pixels.fixed_effects import Design, FixedEffects, Left, pseudo_huber, regress
 from endotwin.pixels.samples import Samples, whole_groups
-from endotwin.pixels.start import LIGHT_MEAN, LIGHT_SPREAD, PRIOR, dark, diffuse, trust
+from endotwin.pixels.start import LIGHT_MEAN, LIGHT_SPREAD, PRIOR, dark, diffuse
 
 if TYPE_CHECKING:
     from endotwin.surface.casting import Caster
@@ -261,7 +261,7 @@ class Probe(Sightings):
             self.vertex,
             self.count,
             self.frame if hypothesis.gain else None,
-            trust(self.samples.cos.numpy().astype(np.float64)),
+            self.trust,
             prior=(np.diag(precision), precision * mean),
         )
 

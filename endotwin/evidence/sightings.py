@@ -9,6 +9,7 @@ import numpy as np
 
 from endotwin.effects.vignetting import squared_radius
 from endotwin.light.guides import visible_in_views
+from endotwin.pixels.start import trust
 from endotwin.surface.vectors import unit
 
 if TYPE_CHECKING:
@@ -84,6 +85,11 @@ class Sightings:
         towards = np.asarray(guides_mm, np.float32) - self.points_mm[:, None]
         before = np.einsum("nka,na->nk", towards, self.normals) > 0
         return (before & self.visible_to(guides_mm) if shadows else before).any(axis=1)
+
+    @cached_property
+    def trust(self) -> np.ndarray:
+        """Inverse variance of what each pixel tells of light, up to one factor, [N]."""
+        return trust(self.samples.cos.numpy().astype(np.float64))
 
     @cached_property
     def shown(self) -> np.ndarray:

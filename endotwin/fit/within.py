@@ -214,7 +214,7 @@ class Within:
         if shared.bounces:
             passing.append(model.by_globals[bright][..., SCALE])
 
-        alike = np.full(len(rows), RATIO_ERROR)
+        alike = np.full(len(rows), RATIO_ERROR**2)
 
         def without(tone: Tone) -> Hues:
             steep, found = predicted * tone.slope(predicted), []
@@ -331,25 +331,25 @@ class Within:
         by_raw = roughness_slope(material[rows, 3])[:, None]
         by_roughness = (model.by_roughness[bright] * by_raw * tells).mean(dim=1).numpy() / predicted
         columns = (residual, by_roughness, by_coat, *slopes.T, *by_guides, *by_faint)
-        error = MODEL_ERROR / np.sqrt(trust(self.samples.cos[rows].numpy()))
-        vertex, frame, *means, weight = self._means(rows, columns, (noise / predicted) ** 2, error)
+        alike = MODEL_ERROR**2 / trust(self.samples.cos[rows].numpy())
+        vertex, frame, *means, weight = self._means(rows, columns, (noise / predicted) ** 2, alike)
         by_shared, by_varied = np.split(np.stack(means[3:], axis=1), [slopes.shape[1]], axis=1)
         return Sightings(vertex, frame, means[0], by_shared, *means[1:3], by_varied, weight)
 
     def _means(
-        self, rows: Tensor, columns: tuple[np.ndarray, ...], variance: np.ndarray, error: np.ndarray
+        self, rows: Tensor, columns: tuple[np.ndarray, ...], variance: np.ndarray, alike: np.ndarray
     ) -> list[np.ndarray]:
         """Vertex, frame, means of the ``columns`` and their inverse variance of what the samples ``rows`` [R]
         show of a vertex in one photo, each [S].
 
-        Noise of ``variance`` [R] is each pixel's own; what the model errs by, ``error`` [R], all have alike.
+        Noise of ``variance`` [R] is each pixel's own; all have alike what the model errs by, of variance
+        ``alike`` [R].
         """
         place = self.vertex[rows.numpy()].astype(np.int64) << 32 | self.samples.frame[rows].numpy()
         place, which = np.unique(place, return_inverse=True)
         total = np.bincount(which, 1 / variance, len(place))
         means = [np.bincount(which, column / variance, len(place)) / total for column in columns]
-        alike = np.bincount(which, error**2, len(place)) / np.bincount(which, minlength=len(place))
-        weight = 1 / (1 / total + alike)
+        weight = 1 / (1 / total + np.bincount(which, alike, len(place)) / np.bincount(which))
         return [place >> 32, (place & 0xFFFFFFFF).astype(np.int32), *means, weight]
 
     def _by_guides(

@@ -83,7 +83,15 @@ def test_a_map_of_the_light_shows_from_where_it_comes_and_where_its_guides_stand
     probe.samples = example.samples[torch.from_numpy(rows)]
     probe.vertex = np.unique(example.vertex[rows], return_inverse=True)[1]
     probe.count = 1 + int(probe.vertex.max())
-    for name in ("frame", "points_mm", "normals", "local_points_mm", "local_normals", "vignetting_column"):
+    for name in (
+        "frame",
+        "points_mm",
+        "normals",
+        "local_points_mm",
+        "local_normals",
+        "vignetting_column",
+        "trust",
+    ):
         vars(probe)[name] = getattr(example, name)[rows]
     probe.target = np.log((albedo * light)[rows]) / 2.2 + rng.normal(0, 0.01, len(rows))
     radius_mm = 2.4
