@@ -25,8 +25,11 @@ from endotwin.effects.film import Film as FilmEffect
 from endotwin.effects.offset import Offset
 from endotwin.effects.specular import Specular
 from endotwin.errors import TwinError
+from endotwin.fit.beneath import Model
 from endotwin.fit.bloom import RADII, bloom
-from endotwin.fit.film import LEAST_DB, Found, Model, _Glints, _Lobes
+from endotwin.fit.film import LEAST_DB, Found
+from endotwin.fit.film import film as found_film
+from endotwin.fit.glints import Glints, Lobes
 from endotwin.fit.lighting import Relighting
 from endotwin.light.film import Film, mirrored, mirrors
 from endotwin.light.shading import F0_WATER
@@ -104,7 +107,7 @@ def known(twin: Twin) -> tuple[Model, Samples]:
 def found(twin: Twin, wanted: str = "auto"):
     """What the fit says of the film, when it knows all else."""
     model, samples = known(twin)
-    return model.film(samples, wanted, lambda *_: None)
+    return found_film(model, samples, wanted, lambda *_: None)
 
 
 @pytest.fixture(scope="module", params=["lens", "guides"])
@@ -213,12 +216,12 @@ def test_the_slopes_of_the_lobes_are_those_of_automatic_differentiation(seed):
     )
     strength = torch.from_numpy(rng.uniform(1, 5, (pairs, guides)))
     values = torch.from_numpy(0.01 * rng.normal(size=(count, 3)))
-    glints = _Glints(np.arange(count), None, of_vertex, half, strength, None, None, None, 0.45)
+    glints = Glints(np.arange(count), None, of_vertex, half, strength, None, None, None, 0.45)
 
     def film(values: torch.Tensor) -> torch.Tensor:
-        return _Lobes(axis, values, 0.15).radiance(glints)
+        return Lobes(axis, values, 0.15).radiance(glints)
 
-    _, slopes = _Lobes(axis, values, 0.15).linearised(glints)
+    _, slopes = Lobes(axis, values, 0.15).linearised(glints)
     jacobian = torch.autograd.functional.jacobian(film, values)[torch.arange(pairs), of_vertex]
     torch.testing.assert_close(slopes, jacobian, rtol=1e-6, atol=1e-9)
 
@@ -257,16 +260,16 @@ def test_a_ray_through_a_vertex_says_nothing_of_the_other_corners():
     relighting = Relighting(twin.surface, Caster(twin.surface), twin.effects, samples.views)
     model = Model(twin, tube_twin.state_of(twin), relighting, relighting._caster)
     vertex = np.unique(twin.surface.triangles[samples.triangle.numpy()])
-    glints = _Glints.of(model.based(samples), vertex)
+    glints = Glints.of(model.based(samples), vertex)
     assert len(glints.shown) and glints.shown.isfinite().all() and glints.radiance.isfinite().all()
 
 
-def made_up(strength: float, shown: torch.Tensor) -> _Glints:
+def made_up(strength: float, shown: torch.Tensor) -> Glints:
     """One vertex in three photos, of ``shown`` [3, 3], a tenth of a degree from each other."""
     half = unit(np.array([[[0, 0.002 * k, 1.0]] for k in range(3)], np.float32))
     normal = torch.tensor([[0.0, 0.0, 1.0]])
     radiance, of_vertex = torch.full((3, 3), 0.05), torch.zeros(3, dtype=torch.long)
     light = torch.full((3, 1), strength)
-    return _Glints(
+    return Glints(
         np.arange(1), torch.arange(3), of_vertex, torch.from_numpy(half), light, shown, radiance, normal, 0.45
     )

@@ -12,8 +12,9 @@ from endotwin.effects import Effects
 from endotwin.effects.coat import Coat
 from endotwin.effects.interreflection import Interreflection
 from endotwin.effects.specular import Specular
-from endotwin.fit.gauss_newton import FIRST_ERROR, PASSING, STANDARD_SPREAD, TEMPER, GaussNewton, unusual
+from endotwin.fit.gauss_newton import FIRST_ERROR, PASSING, STANDARD_SPREAD, TEMPER, GaussNewton
 from endotwin.fit.model import Globals
+from endotwin.fit.prior import unusual
 from endotwin.fit.state import (
     DARKEST,
     GLOBAL_RANGE,

@@ -20,7 +20,8 @@ from endotwin.effects.shadows import Shadows
 from endotwin.effects.sparkle import Sparkle
 from endotwin.effects.specular import Specular
 from endotwin.evaluation import evaluate
-from endotwin.fit.film import Found, Model
+from endotwin.fit.beneath import Model
+from endotwin.fit.film import Found
 from endotwin.fit.lighting import Relighting
 from endotwin.fit.sparkle import sparkle
 from endotwin.light.film import Film

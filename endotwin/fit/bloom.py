@@ -10,7 +10,8 @@ import torch
 
 from endotwin.effects import Decision
 from endotwin.effects.bloom import SATURATION, Bloom
-from endotwin.fit.film import LEAST_DB, Found, Report, decibels
+from endotwin.fit.beneath import decibels
+from endotwin.fit.film import LEAST_DB, Found, Report
 from endotwin.light import shading
 from endotwin.pixels.samples import CLIPPED, Samples, Views
 from endotwin.run.ahead import ahead

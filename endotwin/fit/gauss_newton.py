@@ -17,20 +17,19 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-import scipy.linalg
 import torch
 from torch import Tensor
 
 from endotwin.fit.following import Following
 from endotwin.fit.frame_gains import FramePattern
 from endotwin.fit.hashgrid import HashOperator
-from endotwin.fit.model import GLOBALS, Globals, at_pixels, columns_of, predict
+from endotwin.fit.linear import conjugate_gradients, joint_minimum, squared
+from endotwin.fit.model import F0, GAMMA, at_pixels, columns_of, free_directions, predict
 from endotwin.fit.normal_equations import CHANNELS, MeshPattern, NormalEquations, assemble, robust_cost
-from endotwin.fit.state import GLOBAL_RANGE, ROUGHNESS_RANGE, State, at_furnace, bounded, without_furnace
+from endotwin.fit.prior import global_prior, prior_precision
+from endotwin.fit.state import State, at_furnace, bounded, without_furnace
 from endotwin.light.bounced import WITH_ALL
-from endotwin.light.shading import F0_DIELECTRIC
 from endotwin.pixels.samples import Samples, drawn
-from endotwin.pixels.start import LIGHT_MEAN, LIGHT_SPREAD, PRIOR
 from endotwin.robust import robust_std
 
 CPU = torch.device("cpu")
@@ -44,26 +43,8 @@ TEMPER = 4.0
 HUBER = 1.0
 """Residuals beyond so many noise widths count linearly: rims, highlights, what the model does not know."""
 
-COLOR_SPREAD = 0.5
-ROUGHNESS_LOGIT_SPREAD = 0.1 * 4 / (ROUGHNESS_RANGE[1] - ROUGHNESS_RANGE[0])
-"""Standard deviation of a table entry of a COARSE_MM cell: base colour, roughness."""
-
-COARSE_MM = 12.0
-
-GLOBAL_MEAN = (0.0, *LIGHT_MEAN, math.log(F0_DIELECTRIC), 0.0)
-GLOBAL_SPREAD = (5.0, *LIGHT_SPREAD, 0.5, 0.5)
-"""Prior of the shared parameters, in the order of BOUNCE_GLOBALS."""
-
-USUAL_SIGMAS = 3.0
-AT_EDGE = 0.01
-"""Beyond so many standard deviations of the prior, and so near an edge of their range in shares of one, n, q
-and γ are no endoscope's."""
-
-GAMMA, F0 = (GLOBALS.index(name) for name in ("gamma", "ln f0"))
-
-CG_TOLERANCE = 1e-3
-CG_STEPS = 25
 SEARCH_SAMPLES = 300_000
+"""Samples by which the lengths of a step are judged."""
 
 STANDARD_SPREAD = 0.05
 """Standard deviation among cameras of γ about that of displays: the curves of sRGB, BT.709 and BT.1886 are
@@ -86,14 +67,6 @@ MOST_GAIN_STEP = 1.0
 _NO_GAINS = np.zeros(0)
 LENGTHS = (1.0, 0.5, 0.25, 0.1, 0.03)
 """Of the line search, as shares of the full step."""
-
-
-def prior_precision(operator: HashOperator, unit_mm: float) -> Tensor:
-    """Inverse prior variance of each table entry, float32 [R, 4]."""
-    cell = torch.from_numpy(operator.cells_mm[operator.level] / (unit_mm * COARSE_MM)).float()
-    color = 1 / (COLOR_SPREAD**2 * cell)
-    roughness = 1 / (ROUGHNESS_LOGIT_SPREAD**2 * cell**2)
-    return torch.stack([color, color, color, roughness], dim=1)
 
 
 class Step(NamedTuple):
@@ -143,7 +116,7 @@ class GaussNewton:
         chosen = drawn(len(samples), SEARCH_SAMPLES, np.random.default_rng(seed))
         self.trial_rows = torch.from_numpy(chosen) if len(chosen) < len(samples) else slice(None)
         self.relight(samples)
-        self.squared_adjoint = _squared(self._operator.adjoint_csr)
+        self.squared_adjoint = squared(self._operator.adjoint_csr)
 
     def relight(self, samples: Samples) -> None:
         """Go on with the same samples under other light or exposure."""
@@ -364,7 +337,7 @@ class GaussNewton:
         pull = (precision * (mean - state.shared.vector)).numpy()
         shared_normal = columns.T @ equations.shared @ columns * scale + free.T @ np.diag(precision) @ free
         shared_right = columns.T @ equations.shared_right * scale + free.T @ pull
-        weights, along = _joint_minimum(solved, product(solved), right, shared_normal, shared_right)
+        weights, along = joint_minimum(solved, product(solved), right, shared_normal, shared_right)
         return solved @ self._placed_matrix(weights), torch.from_numpy(free @ along)
 
     def _following(
@@ -392,117 +365,3 @@ class GaussNewton:
 
     def _placed_matrix(self, values: np.ndarray) -> Tensor:
         return torch.from_numpy(values).float().to(self._device)
-
-
-def free_directions(shared: Globals, held: tuple[str, ...]) -> np.ndarray:
-    """Steps of the shared parameters that keep those named in ``held`` (L0, n, q, gamma, f0, albedo scale,
-    or the level γ·ln L0, with which displayed base colours stay): a basis [G, K].
-
-    The light is fitted as γ·ln L0, γ·n and γ·q: γn − n·γ = 0 keeps n while γ moves.
-    """
-    log_L0, n, q = shared.log_light
-    kept = {
-        "L0": [1, 0, 0, -log_L0, 0, 0],
-        "level": [1, 0, 0, 0, 0, 0],
-        "n": [0, 1, 0, -n, 0, 0],
-        "q": [0, 0, 1, -q, 0, 0],
-        "gamma": [0, 0, 0, 1, 0, 0],
-        "f0": [0, 0, 0, 0, 1, 0],
-        "albedo scale": [0, 0, 0, 0, 0, 1],
-    }
-    count = len(shared.vector)
-    if not held:
-        return np.eye(count)
-    return scipy.linalg.null_space(np.array([kept[name][:count] for name in held]))
-
-
-def _joint_minimum(
-    basis: Tensor, image: Tensor, right: Tensor, shared_normal: np.ndarray, shared_right: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Minimise the bordered quadratic over the shared parameters and the span of ``basis``.
-
-    With exact solutions as basis this is elimination by Schur complement; with truncated ones it still
-    descends.
-
-    Args:
-        basis, image, right: [R, C, 1 + G]: solutions, their products with the matrix, right-hand sides, of
-            which the
-            first is the residual's and the others border the matrix.
-
-    Returns:
-        weights of the basis [1 + G]; shared step [G].
-    """
-    columns = basis.shape[2]
-    flat = [x.reshape(-1, columns).double().cpu().numpy() for x in (basis, image, right)]
-    inner, border = flat[0].T @ flat[1], flat[0].T @ flat[2]
-    matrix = np.block([[inner, border[:, 1:]], [border[:, 1:].T, shared_normal]])
-    solution = np.linalg.lstsq(matrix, np.r_[border[:, 0], shared_right], rcond=1e-12)[0]
-    return solution[:columns], solution[columns:]
-
-
-def conjugate_gradients(
-    product: Callable[[Tensor], Tensor],
-    right: Tensor,
-    inverse: Tensor,
-    out_of_time: Callable[[], bool] = lambda: False,
-) -> Tensor:
-    """Solve for all right-hand sides [R, C, K] at once, preconditioned by blocks ``inverse`` [R, C, C].
-
-    Ended early, when ``out_of_time`` says so, it still gives a step that descends.
-    """
-    x = torch.zeros_like(right)
-    residual = right.clone()
-    z = inverse @ residual
-    direction = z.clone()
-    energy = (residual * z).sum(dim=(0, 1))
-    goal = CG_TOLERANCE**2 * energy
-    for _ in range(CG_STEPS):
-        image = product(direction)
-        length = energy / (direction * image).sum(dim=(0, 1)).clamp_min(1e-30)
-        x += length * direction
-        residual -= length * image
-        z = inverse @ residual
-        renewed = (residual * z).sum(dim=(0, 1))
-        if (renewed <= goal).all() or out_of_time():
-            break
-        direction = z + (renewed / energy.clamp_min(1e-30)) * direction
-        energy = renewed
-    return x
-
-
-def global_prior(unit_mm: float, count: int) -> tuple[Tensor, Tensor]:
-    """Mean and standard deviation of ``count`` shared parameters; L0 is the light at a distance of 1 mm,
-    but its prior that at 1 unit."""
-    mean, spread = (
-        torch.tensor(values[:count], dtype=torch.float64) for values in (GLOBAL_MEAN, GLOBAL_SPREAD)
-    )
-    mean[0] += mean[2] * math.log(unit_mm)
-    return mean, spread
-
-
-def unusual(shared: Globals) -> list[str]:
-    """Those of n, q and γ, with what is usual, that lie more than USUAL_SIGMAS of the prior from its mean, or
-    at an edge of their range."""
-    _, n, q = shared.log_light
-    found = []
-    for index, name, value in ((1, "n", n), (2, "q", q), (3, "γ", shared.gamma)):
-        scale = 1.0 if name == "γ" else PRIOR["gamma"]
-        mean, spread = GLOBAL_MEAN[index] / scale, GLOBAL_SPREAD[index] / scale
-        low, high = max(0.0, mean - USUAL_SIGMAS * spread), mean + USUAL_SIGMAS * spread
-        from_edge = min(abs(float(shared.vector[index]) - edge) for edge in GLOBAL_RANGE[index])
-        at_edge = from_edge < AT_EDGE * GLOBAL_SPREAD[index]
-        if at_edge or not low <= value <= high:
-            edge = "the edge of what is tried, " if at_edge else ""
-            found.append(f"{name} {value:.3f} ({edge}usually {low:.3f} to {high:.3f})")
-    return found
-
-
-def _squared(matrix: Tensor) -> Tensor:
-    """The CSR matrix with each entry squared."""
-    return torch.sparse_csr_tensor(
-        matrix.crow_indices(),
-        matrix.col_indices(),
-        matrix.values() ** 2,
-        matrix.shape,
-        check_invariants=False,
-    )

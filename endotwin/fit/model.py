@@ -7,6 +7,7 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
+import scipy.linalg
 import torch
 from torch import Tensor
 
@@ -19,6 +20,8 @@ from endotwin.twin import Light, Response
 
 GLOBALS = ("gamma·ln L0", "gamma·n", "gamma·q", "gamma", "ln f0")
 """The shared parameters as they are fitted: those in which a diffuse surface's log C is linear."""
+
+GAMMA, F0 = (GLOBALS.index(name) for name in ("gamma", "ln f0"))
 
 BOUNCE_GLOBALS = (*GLOBALS, "ln albedo scale")
 """With interreflection there is one more: it tells how bright the tissue is beside the light."""
@@ -94,6 +97,28 @@ def columns_of(shared: Globals, bordered: bool) -> np.ndarray:
     plain = np.eye(len(GLOBALS), len(shared.vector))[: len(GLOBALS) * bordered]
     scale = np.eye(len(shared.vector))[len(GLOBALS) :]
     return np.concatenate([plain, *[scale] * 3])
+
+
+def free_directions(shared: Globals, held: tuple[str, ...]) -> np.ndarray:
+    """Steps of the shared parameters that keep those named in ``held`` (L0, n, q, gamma, f0, albedo scale,
+    or the level γ·ln L0, with which displayed base colours stay): a basis [G, K].
+
+    The light is fitted as γ·ln L0, γ·n and γ·q: γn − n·γ = 0 keeps n while γ moves.
+    """
+    log_L0, n, q = shared.log_light
+    kept = {
+        "L0": [1, 0, 0, -log_L0, 0, 0],
+        "level": [1, 0, 0, 0, 0, 0],
+        "n": [0, 1, 0, -n, 0, 0],
+        "q": [0, 0, 1, -q, 0, 0],
+        "gamma": [0, 0, 0, 1, 0, 0],
+        "f0": [0, 0, 0, 0, 1, 0],
+        "albedo scale": [0, 0, 0, 0, 0, 1],
+    }
+    count = len(shared.vector)
+    if not held:
+        return np.eye(count)
+    return scipy.linalg.null_space(np.array([kept[name][:count] for name in held]))
 
 
 def at_pixels(samples: Samples, triangles: Tensor, per_vertex: Tensor) -> Tensor:

@@ -21,14 +21,17 @@ from endotwin.errors import SequenceError
 from endotwin.evidence.decide import Decided, decide
 from endotwin.evidence.glints import Glints
 from endotwin.evidence.guide_search import Guides
+from endotwin.fit.beneath import Model
 from endotwin.fit.bloom import bloom
 from endotwin.fit.faint import NOTHING, Faint
-from endotwin.fit.film import Found, Model
-from endotwin.fit.gauss_newton import CPU, GaussNewton, unusual
+from endotwin.fit.film import Found
+from endotwin.fit.film import film as found_film
+from endotwin.fit.gauss_newton import CPU, GaussNewton
 from endotwin.fit.hashgrid import HashGrid, HashOperator
 from endotwin.fit.heal import extended
 from endotwin.fit.light_stage import Cost, FoundLight, LightStage
 from endotwin.fit.lighting import Relighting
+from endotwin.fit.prior import unusual
 from endotwin.fit.sparkle import sparkle
 from endotwin.fit.state import State
 from endotwin.fit.tilt import Tilter
@@ -344,7 +347,7 @@ class _Fit:
         )
         with pace.stopwatch.stage("film"):
             if not pace.out_of_time():
-                wet = model.film(samples, film, pace.report)
+                wet = found_film(model, samples, film, pace.report)
         with pace.stopwatch.stage("sparkle"):
             if not pace.out_of_time():
                 glitter = sparkle(wet, samples.views, sparkles, pace.report)

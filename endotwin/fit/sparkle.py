@@ -24,8 +24,9 @@ from scipy.special import exp1, xlogy
 from endotwin.cameras.base import solid_angle
 from endotwin.effects import Decision
 from endotwin.effects.sparkle import Sparkle
-from endotwin.fit.film import APART, GLINT, Model, Report, exposure_of
+from endotwin.fit.beneath import APART, GLINT, Model, exposure_of
 from endotwin.fit.film import Found as FoundFilm
+from endotwin.fit.film import Report
 from endotwin.fit.heal import REACH_PX
 from endotwin.light import shading
 from endotwin.light.film import Film, mirrors, mirrors_in_view

@@ -14,7 +14,8 @@ import torch
 from torch import Tensor
 
 from endotwin.effects import Effects
-from endotwin.fit.gauss_newton import HUBER, TEMPER, GaussNewton, conjugate_gradients
+from endotwin.fit.gauss_newton import HUBER, TEMPER, GaussNewton
+from endotwin.fit.linear import conjugate_gradients
 from endotwin.fit.model import at_pixels, displayed, glow, radiance
 from endotwin.fit.normal_equations import CHUNK, Residual, add_products, pairs_of
 from endotwin.fit.state import State

@@ -25,14 +25,9 @@ from endotwin.effects.tone import Tone, bend
 from endotwin.evidence.coat import LEAST_SIGHTINGS, Highlights
 from endotwin.evidence.tone import Hues
 from endotwin.fit.faint import NOTHING, Faint
-from endotwin.fit.gauss_newton import (
-    F0,
-    ROUGHNESS_LOGIT_SPREAD,
-    TEMPER,
-    free_directions,
-    global_prior,
-)
-from endotwin.fit.model import BOUNCE_GLOBALS, Globals, linearise, predict
+from endotwin.fit.gauss_newton import TEMPER
+from endotwin.fit.model import BOUNCE_GLOBALS, F0, Globals, free_directions, linearise, predict
+from endotwin.fit.prior import ROUGHNESS_LOGIT_SPREAD, global_prior
 from endotwin.fit.state import bounded, roughness_slope
 from endotwin.light import shading
 from endotwin.pixels.fixed_effects import Design, regress

@@ -120,8 +120,7 @@ def test_a_parameter_that_the_photos_cannot_tell_is_still_at_its_prior_after_the
 
 
 def test_steps_along_free_directions_leave_what_is_held():
-    from endotwin.fit.gauss_newton import free_directions
-    from endotwin.fit.model import Globals
+    from endotwin.fit.model import Globals, free_directions
 
     shared = Globals.of(Light(30.0, 1.7, 2.2), Response(0.4), 0.04)
     for held in ((), ("n",), ("q",), ("n", "q"), ("n", "q", "gamma")):

@@ -1,0 +1,77 @@
+"""Linear equations of a step: conjugate gradients, and the least cost beside a border of a few unknowns."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from torch import Tensor
+
+CG_TOLERANCE = 1e-3
+CG_STEPS = 25
+
+
+def conjugate_gradients(
+    product: Callable[[Tensor], Tensor],
+    right: Tensor,
+    inverse: Tensor,
+    out_of_time: Callable[[], bool] = lambda: False,
+) -> Tensor:
+    """Solve for all right-hand sides [R, C, K] at once, preconditioned by blocks ``inverse`` [R, C, C].
+
+    Ended early, when ``out_of_time`` says so, it still gives a step that descends.
+    """
+    x = torch.zeros_like(right)
+    residual = right.clone()
+    z = inverse @ residual
+    direction = z.clone()
+    energy = (residual * z).sum(dim=(0, 1))
+    goal = CG_TOLERANCE**2 * energy
+    for _ in range(CG_STEPS):
+        image = product(direction)
+        length = energy / (direction * image).sum(dim=(0, 1)).clamp_min(1e-30)
+        x += length * direction
+        residual -= length * image
+        z = inverse @ residual
+        renewed = (residual * z).sum(dim=(0, 1))
+        if (renewed <= goal).all() or out_of_time():
+            break
+        direction = z + (renewed / energy.clamp_min(1e-30)) * direction
+        energy = renewed
+    return x
+
+
+def joint_minimum(
+    basis: Tensor, image: Tensor, right: Tensor, shared_normal: np.ndarray, shared_right: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Minimise the bordered quadratic over the shared parameters and the span of ``basis``.
+
+    With exact solutions as basis this is elimination by Schur complement; with truncated ones it still
+    descends.
+
+    Args:
+        basis, image, right: [R, C, 1 + G]: solutions, their products with the matrix, right-hand sides, of
+            which the
+            first is the residual's and the others border the matrix.
+
+    Returns:
+        weights of the basis [1 + G]; shared step [G].
+    """
+    columns = basis.shape[2]
+    flat = [x.reshape(-1, columns).double().cpu().numpy() for x in (basis, image, right)]
+    inner, border = flat[0].T @ flat[1], flat[0].T @ flat[2]
+    matrix = np.block([[inner, border[:, 1:]], [border[:, 1:].T, shared_normal]])
+    solution = np.linalg.lstsq(matrix, np.r_[border[:, 0], shared_right], rcond=1e-12)[0]
+    return solution[:columns], solution[columns:]
+
+
+def squared(matrix: Tensor) -> Tensor:
+    """The CSR matrix with each entry squared."""
+    return torch.sparse_csr_tensor(
+        matrix.crow_indices(),
+        matrix.col_indices(),
+        matrix.values() ** 2,
+        matrix.shape,
+        check_invariants=False,
+    )
