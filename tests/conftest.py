@@ -32,22 +32,36 @@ def example() -> Path:
 
 
 @pytest.fixture(scope="session")
-def fused(example, tmp_path_factory) -> Callable[[float], endotwin.Twin]:
-    """The twin of the bundled example at a scale, fused once a run, whichever worker needs it first."""
+def once(tmp_path_factory) -> Callable[[str, Callable[[], endotwin.Twin]], endotwin.Twin]:
+    """A twin by its name, made once a run, whichever worker needs it first."""
     root = tmp_path_factory.getbasetemp()
     root = root.parent if "PYTEST_XDIST_WORKER" in os.environ else root
-    (root / "fused").mkdir(exist_ok=True)
 
-    def fused(scale: float = 1.0) -> endotwin.Twin:
-        kept, lock = root / "fused" / str(scale), locks.take(root)
+    def once(name: str, make: Callable[[], endotwin.Twin]) -> endotwin.Twin:
+        kept, turn = root / "once" / name, root / f"once-{name}.lock"
+        turn.touch()
+        lock = locks.take(turn)
         try:
             if not kept.exists():
-                endotwin.fuse_twin(example, scale=scale).save(kept)
+                kept.parent.mkdir(exist_ok=True)
+                make().save(kept)
             return endotwin.Twin.load(kept)
         finally:
             locks.release(lock)
 
-    return fused
+    return once
+
+
+@pytest.fixture(scope="session")
+def fused(example, once) -> Callable[[float], endotwin.Twin]:
+    """The twin of the bundled example at a scale."""
+    return lambda scale=1.0: once(f"fused-{scale}", lambda: endotwin.fuse_twin(example, scale=scale))
+
+
+@pytest.fixture(scope="session")
+def fitted(fused, once) -> endotwin.Twin:
+    """The twin of the bundled example at half its size, fitted."""
+    return once("fitted", lambda: endotwin.fit_twin(fused(0.5)))
 
 
 @pytest.fixture(scope="module")

@@ -216,7 +216,7 @@ def test_a_hand_eye_error_is_found_and_held_out_photos_gain(fused, tmp_path, cap
     assert invoke("fuse", tmp_path / "spoilt", "-o", tmp_path / "twin") == 0
     quickly = {
         "effects": dict.fromkeys(("offset", "interreflection", "gain", "coat", "tone"), "off"),
-        "config": replace(STANDARD.fit, tilts=0),
+        "config": replace(STANDARD.fit, pixels=400_000, steps=1, tilts=0),
     }
     plain = endotwin.evaluate(endotwin.fit_twin(tmp_path / "twin", align="off", **quickly))
     assert (

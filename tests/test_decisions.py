@@ -1,7 +1,8 @@
 """Which effects a fit finds in small scenes of the independent renderer."""
 
+from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
+from functools import cache
 
 import pytest
 from independent.lens import Lens
@@ -16,26 +17,37 @@ from endotwin.fit import light_stage
 from endotwin.twin import Twin
 
 
-def fitted(folder: Path, seed: int, effects: set[str]) -> tuple[Twin, dict]:
-    """The twin of a seed's scene with these effects, at 160×120, and the scene's truth."""
-    scene = Scene.draw(seed).having(frozenset(effects))
-    made = make(replace(scene, lens=Lens.pinhole(160, 120, 100), frames=9), folder)
-    return endotwin.fit_twin(endotwin.fuse_twin(folder)), made
+@pytest.fixture(scope="module")
+def find(tmp_path_factory) -> Callable[[int, set[str]], tuple[Twin, dict]]:
+    """The fitted twin of a seed's scene with these effects, at 160×120, and the scene's truth."""
+
+    @cache
+    def fused(seed: int, effects: frozenset[str]) -> tuple[Twin, dict]:
+        folder = tmp_path_factory.mktemp("scene")
+        scene = replace(Scene.draw(seed).having(effects), lens=Lens.pinhole(160, 120, 100), frames=9)
+        made = make(scene, folder)
+        return endotwin.fuse_twin(folder), made
+
+    def find(seed: int, effects: set[str]) -> tuple[Twin, dict]:
+        twin, made = fused(seed, frozenset(effects))
+        return endotwin.fit_twin(twin), made
+
+    return find
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("seed", "effects"), [(12, {"gain"}), (13, {"profile"})], ids=["gain", "profile"])
-def test_a_fit_finds_what_a_scene_has_and_nothing_else(tmp_path: Path, seed: int, effects: set[str]) -> None:
-    twin, made = fitted(tmp_path, seed, effects)
+def test_a_fit_finds_what_a_scene_has_and_nothing_else(find, seed: int, effects: set[str]) -> None:
+    twin, made = find(seed, effects)
     assert {name for name in EFFECTS if twin.decisions[name].state == "on"} == effects
     assert all(shown["levels"] > 1 for shown in made["shown"].values())
     assert twin.response.gamma == pytest.approx(made["gamma"], rel=0.04)
 
 
 @pytest.mark.slow
-def test_the_strength_of_a_bounce_off_pale_tissue_is_found(tmp_path: Path) -> None:
+def test_the_strength_of_a_bounce_off_pale_tissue_is_found(find) -> None:
     """The 98th percentile of its red is 0.85, not far below a furnace."""
-    twin, made = fitted(tmp_path, 237, {"interreflection"})
+    twin, made = find(237, {"interreflection"})
     assert twin.light.L0 / made["L0"] == pytest.approx(1, rel=0.1)
     assert twin.light.n == pytest.approx(made["n"], rel=0.1)
     assert twin.response.gamma == pytest.approx(made["gamma"], rel=0.03)
@@ -43,20 +55,20 @@ def test_the_strength_of_a_bounce_off_pale_tissue_is_found(tmp_path: Path) -> No
 
 
 @pytest.mark.slow
-def test_a_response_that_no_display_has_is_found_where_light_bounces(tmp_path: Path) -> None:
+def test_a_response_that_no_display_has_is_found_where_light_bounces(find) -> None:
     """What the model errs by says how far photos are believed, and it is little here."""
-    twin, made = fitted(tmp_path, 177, {"interreflection"})
+    twin, made = find(177, {"interreflection"})
     assert made["gamma"] > 0.51
     assert twin.response.gamma == pytest.approx(made["gamma"], rel=0.04)
 
 
 @pytest.mark.slow
-def test_a_haze_brighter_than_water_does_not_ruin_a_bounce(tmp_path: Path, monkeypatch) -> None:
+def test_a_haze_brighter_than_water_does_not_ruin_a_bounce(find, monkeypatch) -> None:
     """Whatever the highlights say: all pixels of such tissue give it hardly any weight, or are worse."""
     said = Decision("on", "the highlights say so", 1.1)
     haze = Coat(weight=7.0, roughness=0.32, tail=1.0)
     monkeypatch.setattr(light_stage, "judged_coat", lambda highlights, wanted, tried: (haze, said))
-    twin, made = fitted(tmp_path, 224, {"interreflection"})
+    twin, made = find(224, {"interreflection"})
     assert "interreflection" in twin.effects and said.reason in twin.decisions["coat"].reason
     assert "coat" not in twin.effects or twin.effects["coat"].weight < 0.05 * haze.weight
     assert twin.response.gamma == pytest.approx(made["gamma"], rel=0.06)
@@ -64,13 +76,11 @@ def test_a_haze_brighter_than_water_does_not_ruin_a_bounce(tmp_path: Path, monke
 
 
 @pytest.mark.slow
-def test_a_false_tone_curve_is_taken_back_where_hues_ask_for_none_beside_it(
-    tmp_path: Path, monkeypatch
-) -> None:
+def test_a_false_tone_curve_is_taken_back_where_hues_ask_for_none_beside_it(find, monkeypatch) -> None:
     said = Decision("on", "the hues say so", 1.1)
     monkeypatch.setattr(light_stage, "judged_tone", lambda hues, wanted: (Tone(0.4), said))
     monkeypatch.setattr(light_stage, "steadied", lambda tone, hues: Tone(0.05))
-    twin, made = fitted(tmp_path, 237, {"interreflection"})
+    twin, made = find(237, {"interreflection"})
     assert twin.decisions["tone"].state == "off" and said.reason in twin.decisions["tone"].reason
     assert "tone" not in twin.effects and "interreflection" in twin.effects
     assert twin.response.gamma == pytest.approx(made["gamma"], rel=0.05)

@@ -30,8 +30,8 @@ def heldout(twin):
         yield renderer.view(sequence.T_world_camera[index]).color, sequence.frame(index).color / 255
 
 
-def test_no_dots_remain_along_rims_in_the_held_out_renders_of_the_example(fused):
-    for render, photo in heldout(endotwin.fit_twin(fused())):
+def test_no_dots_remain_along_rims_in_the_held_out_renders_of_the_example(fitted):
+    for render, photo in heldout(fitted):
         assert not dots(render, photo).any()
         brightness = render.max(axis=2)
         usual = cv2.medianBlur(brightness, 5)

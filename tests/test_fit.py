@@ -41,12 +41,6 @@ def tube(tmp_path_factory) -> endotwin.Twin:
     return endotwin.fuse_twin(tube_sequence.write(tmp_path_factory.mktemp("fit") / "tube", frames=10))
 
 
-@pytest.fixture(scope="module")
-def colon(fused) -> endotwin.Twin:
-    """The bundled example at half its size, fitted."""
-    return endotwin.fit_twin(fused(0.5))
-
-
 def made(sequence: Path) -> dict:
     return json.loads((sequence / "truth" / "made.json").read_text())
 
@@ -78,19 +72,19 @@ def same_materials(one: endotwin.Twin, other: endotwin.Twin) -> bool:
     )
 
 
-def test_light_and_response_of_the_example_are_recovered(colon, example):
+def test_light_and_response_of_the_example_are_recovered(fitted, example):
     truth = made(example)
-    assert colon.response.gamma == pytest.approx(truth["gamma"], rel=0.03)
-    assert colon.light.n == pytest.approx(truth["light"]["n"], rel=0.05)
-    assert colon.light.q == pytest.approx(truth["light"]["q"], rel=0.04)
+    assert fitted.response.gamma == pytest.approx(truth["gamma"], rel=0.03)
+    assert fitted.light.n == pytest.approx(truth["light"]["n"], rel=0.05)
+    assert fitted.light.q == pytest.approx(truth["light"]["q"], rel=0.04)
 
 
-def test_base_color_of_the_example_is_the_painted_albedo_up_to_one_scale(colon, example):
-    assert albedo_rmse(colon, example) < 0.05
+def test_base_color_of_the_example_is_the_painted_albedo_up_to_one_scale(fitted, example):
+    assert albedo_rmse(fitted, example) < 0.05
 
 
-def test_the_example_predicts_photos_that_it_never_saw(colon):
-    assert endotwin.evaluate(colon).psnr_covered > 33
+def test_the_example_predicts_photos_that_it_never_saw(fitted):
+    assert endotwin.evaluate(fitted).psnr_covered > 33
 
 
 def test_a_tone_curve_over_the_example_is_found_and_leaves_the_response(fused, example, tmp_path):
@@ -107,28 +101,28 @@ def test_a_tone_curve_over_the_example_is_found_and_leaves_the_response(fused, e
     assert twin.response.gamma == pytest.approx(made(example)["gamma"], rel=0.03)
 
 
-def test_interreflection_that_no_photo_shows_is_fitted_away(colon):
-    forced = fit(colon, effects={"interreflection": "on"})
+def test_interreflection_that_no_photo_shows_is_fitted_away(fitted):
+    forced = fit(fitted, effects={"interreflection": "on"})
     assert forced.decisions["interreflection"].state == "on"
     assert forced.effects["interreflection"].strength == 0
     assert "none of it" in forced.decisions["interreflection"].reason
-    assert forced.response.gamma == pytest.approx(colon.response.gamma, rel=0.01)
-    assert endotwin.evaluate(forced).psnr_covered > endotwin.evaluate(colon).psnr_covered - 0.1
+    assert forced.response.gamma == pytest.approx(fitted.response.gamma, rel=0.01)
+    assert endotwin.evaluate(forced).psnr_covered > endotwin.evaluate(fitted).psnr_covered - 0.1
 
 
-def test_materials_are_physical_and_the_brightest_albedo_has_the_agreed_scale(colon):
-    materials = colon.materials
+def test_materials_are_physical_and_the_brightest_albedo_has_the_agreed_scale(fitted):
+    materials = fitted.materials
     assert materials.base_color.min() >= 0 and materials.base_color.max() <= 1
     assert materials.roughness.min() >= 0 and materials.roughness.max() <= 1
     assert not materials.metallic.any() and 0 < materials.f0 < 0.5
-    assert np.percentile(materials.base_color[colon.surface.seen_by > 0].max(axis=1), 98) == pytest.approx(
+    assert np.percentile(materials.base_color[fitted.surface.seen_by > 0].max(axis=1), 98) == pytest.approx(
         0.8, rel=1e-3
     )
     assert all(value.dtype == np.float32 for value in materials.per_vertex.values())
 
 
-def test_the_record_tells_the_method_and_the_seconds_of_each_stage(colon):
-    record = colon.record["fit"]
+def test_the_record_tells_the_method_and_the_seconds_of_each_stage(fitted):
+    record = fitted.record["fit"]
     assert record["method"] == "twin" and record["undetermined"] == []
     assert set(record["stages"]) >= {"gather", "start", "light", "detail"}
     assert sum(record["stages"].values()) == pytest.approx(record["seconds"], rel=0.1, abs=0.1)
@@ -233,15 +227,12 @@ def test_proxies_are_the_means_of_the_vertices_of_a_cell(tube):
 
 @pytest.fixture(scope="module")
 def colon_direct(data_root) -> endotwin.Twin:
-    threads = torch.get_num_threads()
-    torch.set_num_threads(2)
-    twin = endotwin.fit_twin(endotwin.fuse_twin(data_root / "colon_direct"))
-    torch.set_num_threads(threads)
-    return twin
+    """64 frames at half of 640×480."""
+    return endotwin.fit_twin(endotwin.fuse_twin(data_root / "colon_direct", scale=0.5))
 
 
 def test_a_full_sequence_reaches_the_promised_accuracy(colon_direct, data_root):
-    """64 frames at 640×480 with highlights and noise; light cos²θ/d², gamma 1/2.2."""
+    """With highlights and noise; light cos²θ/d², gamma 1/2.2."""
     assert colon_direct.response.gamma == pytest.approx(1 / 2.2, rel=0.02)
     assert colon_direct.light.q == pytest.approx(2, rel=0.03)
     assert colon_direct.light.n == pytest.approx(2, rel=0.05)

@@ -314,7 +314,7 @@ def mean_distance_mm(surface, truth: Path) -> float:
 
 def test_colon_fisheye_fuses_within_a_twentieth_of_a_millimetre(data_root):
     sequence = open_sequence(data_root / "colon_fisheye")
-    surface = fuse(sequence, voxel_mm=0.4)
+    surface = fuse(sequence, voxel_mm=0.4, frames=range(0, len(sequence), 3))
     assert mean_distance_mm(surface, data_root / "colon_fisheye" / "truth" / "colon.ply") < 0.05
 
 

@@ -1,18 +1,14 @@
 """A kill at a change of a file, of every command that writes: old or new, and the next leaves no trace."""
 
-import io
 import json
 import re
 import shutil
-from contextlib import chdir, redirect_stdout
 from pathlib import Path
-from subprocess import CompletedProcess
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import tube_sequence
-from command_line import invoke
+from command_line import in_one_process, invoke
 from faults import Killed, killed
 from test_full_disk import COMMANDS, contents
 
@@ -64,16 +60,9 @@ def begun(made, tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope="module", autouse=True)
-def in_one_process():
-    """Commands that ``tradeoff`` runs in processes of their own are killed with it."""
-
-    def run(command, cwd, **_) -> CompletedProcess:
-        with chdir(cwd), redirect_stdout(io.StringIO()) as out:
-            code = invoke(*command[3:])
-        return CompletedProcess(command, code, out.getvalue(), "")
-
+def killed_with_what_it_runs():
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("endotwin.tradeoff.measure.subprocess", SimpleNamespace(run=run))
+        in_one_process(patch)
         yield
 
 

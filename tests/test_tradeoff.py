@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 import pytest
 import tube_sequence
+from command_line import in_one_process
 from endotwin.cli.main import main
 from hypothesis import given
 from hypothesis import strategies as st
@@ -169,7 +170,8 @@ class Interrupted(BaseException):
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory) -> tuple[Path, list[dict], int]:
-    """Two rungs and an effect, stopped in the second and run again: folder, rows, count of measurements."""
+    """Two rungs and an effect, stopped in the second and run again: folder, rows, count of measurements. The
+    first rung's commands have processes of their own."""
     work = tmp_path_factory.mktemp("tradeoff")
     tube = tube_sequence.write(work / "tube", 9, 48, 36)
     rungs, calls, measured = ladder("steps=0,voxel=3+steps=0", "1s"), [], run.measured
@@ -189,6 +191,7 @@ def made(tmp_path_factory) -> tuple[Path, list[dict], int]:
         with pytest.raises(OutputError, match=r"out\.partial holds the results of another sequence"):
             tradeoff(tube, work / "out", rungs, repeats=1, geometry="heldout")
         patch.setattr(effects, "FITTED", ("coat",))
+        in_one_process(patch)
         rows, _ = tradeoff(tube, work / "out", rungs, repeats=1, base=effects.base("steps=0"))
     return work / "out", rows, len(calls)
 
