@@ -316,13 +316,3 @@ def test_a_dataset_with_fluids_is_proved(tmp_path, motion):
     document = json.loads((tmp_path / "d" / "dataset.json").read_text())
     assert [fluid["kind"] for fluid in document["fluids"]] == ["blood", "mucus", "stool", "stool"]
     assert "mucus, " in (tmp_path / "d" / "datasheet.html").read_text()
-
-
-@pytest.mark.slow
-def test_any_number_of_workers_writes_the_same_bytes(bare, tmp_path):
-    path = np.stack([tube_twin.pose(s) for s in np.linspace(0.3, 0.5, 40)])
-    for workers in (1, 2):
-        endotwin.synthesize(bare, path, tmp_path / str(workers), fluids=SEVERAL, seed=1, workers=workers)
-    files = [{file.name: file.read_bytes() for file in (tmp_path / n).iterdir()} for n in ("1", "2")]
-    assert files[0] == files[1]
-    assert "0039_fluid.png" in files[0]

@@ -100,15 +100,9 @@ def places() -> Iterator[Finding]:
     decibel, gamma = _apart(travel(Tube(shift_mm=1e6)), here)
     yield Finding("Scene 10⁶ mm from the origin: PSNR apart", decibel, 0.1, unit="dB")
     yield Finding("Scene 10⁶ mm from the origin: γ apart", 100 * gamma, 0.2, unit="%")
-    for scale in (8**-3, 8**3):
-        decibel, gamma = _apart(travel(Tube(scale=scale)), here)
-        yield Finding(f"Scene scaled by {scale:.3g}: PSNR apart", decibel, 0.3, unit="dB")
     for scale in (1e-3, 1e3):
-        there = travel(Tube(scale=scale))
-        _, gamma = _apart(there, here)
-        sound = not there.refused and not there.not_finite
-        psnr = there.scores.psnr_covered if sound else math.nan
-        yield Finding(f"Scene scaled by {scale:g}: PSNR", psnr, 33, at_least=True, unit="dB")
+        decibel, gamma = _apart(travel(Tube(scale=scale)), here)
+        yield Finding(f"Scene scaled by {scale:g}: PSNR apart", decibel, 0.3, unit="dB")
         yield Finding(f"Scene scaled by {scale:g}: γ apart", 100 * gamma, 3, unit="%")
 
 
