@@ -27,9 +27,10 @@ from endotwin.effects.specular import Specular
 from endotwin.errors import TwinError
 from endotwin.fit.beneath import Model
 from endotwin.fit.bloom import RADII, bloom
+from endotwin.fit.by_pixels import by_pixels
 from endotwin.fit.film import LEAST_DB, Found
 from endotwin.fit.film import film as found_film
-from endotwin.fit.glints import Glints, Lobes
+from endotwin.fit.glints import Glints, Lobes, gains_in_other_photos_db, pairs_in
 from endotwin.fit.lighting import Relighting
 from endotwin.light.film import Film, mirrored, mirrors
 from endotwin.light.shading import F0_WATER
@@ -154,6 +155,26 @@ def test_where_a_photo_met_the_mirror_direction_the_films_normal_is_known_to_hal
 def angles(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Between unit vectors [..., 3], in radians."""
     return 2 * np.arcsin(np.minimum(np.linalg.norm(a - b, axis=-1) / 2, 1))
+
+
+@pytest.mark.slow
+def test_lobes_by_pixels_leave_less_than_by_their_means_and_of_unseen_photos_no_more(scene):
+    twin, film, _, _ = scene
+    model, samples = known(twin)
+    based = model.based(samples)
+    based, apart = based[~based.apart], based[based.apart]
+    glints = Glints.of(based, film.vertex)
+    by_means = glints.fitted(ROUGHNESS)
+    finer = by_pixels(based, glints, by_means)
+
+    def left(lobes: Lobes) -> float:
+        mix, _, _ = pairs_in(based, film.vertex)
+        shone = torch.from_numpy(mix @ lobes.radiance(glints).numpy())[:, None]
+        return float(((based.shown - based.predicted(shone)) ** 2).sum())
+
+    assert left(finer) < 0.9 * left(by_means)
+    before_db, after_db = gains_in_other_photos_db(apart, film.vertex, [by_means, finer])
+    assert after_db > before_db - 0.1
 
 
 @pytest.mark.slow

@@ -88,6 +88,11 @@ class Based:
         return Based(self.model, self.samples[index], self.radiance[index])
 
     @property
+    def apart(self) -> Tensor:
+        """Bool [N]: pixels of photos that are kept apart."""
+        return torch.from_numpy(self.samples.views.row(self.samples.frame) % APART == APART // 2)
+
+    @property
     def shines(self) -> Tensor:
         """Bool [N]: glints."""
         return (self.shown - self.predicted())[:, 1:].amin(dim=1) > GLINT

@@ -17,7 +17,8 @@ from endotwin.cameras import Camera
 from endotwin.effects import Decision
 from endotwin.effects.film import Film as FilmEffect
 from endotwin.fit.beneath import APART, Based, Model
-from endotwin.fit.glints import Glints, gains_in_other_photos_db
+from endotwin.fit.by_pixels import by_pixels
+from endotwin.fit.glints import Glints, Lobes, gains_in_other_photos_db
 from endotwin.fit.heal import REACH_PX, healed
 from endotwin.fit.lighting import lit
 from endotwin.light.film import Film
@@ -73,22 +74,30 @@ def film(model: Model, samples: Samples, wanted: str, report: Report) -> Found:
     shown = whole.based(_about(judges, report))
     glints = Glints.of(shown, shown.vertices())
     ours = glints[glints.row % APART != APART // 2]
-    trials = [ours.fitted(each) for each in ROUGHNESSES]
-    gains_db = gains_in_other_photos_db(judges, glints.vertex, trials)
-    # A broader lobe also shines in views that no photo had: the sharpest that predicts about as well.
-    best = next(k for k, each in enumerate(gains_db) if each >= max(gains_db) - LEAST_DB)
-    gain_db, roughness = gains_db[best], ROUGHNESSES[best]
+    lobes, gain_db = _sharpest(judges, ours)
     judged = len(samples.views.frames) > APART // 2
     if wanted == "auto" and judged and gain_db < LEAST_DB:
         return Found(decided("off", "does not predict the glints of other photos", gain_db), model)
-    wet, apart = glints.fitted(roughness).film(glints), trials[best].film(ours)
+    every, finer = glints.fitted(lobes.roughness), by_pixels(shown[~shown.apart], ours, lobes)
+    (finer_db,) = gains_in_other_photos_db(judges, glints.vertex, [finer])
+    if finer_db > gain_db:
+        lobes, gain_db, every = finer, finer_db, by_pixels(shown, glints, every)
+    wet = every.film(glints)
     reason = f"predicts glints of other photos, on {len(wet):,} vertices ({gain_db:+.2f} dB)"
     if not judged:
         reason = f"glints cost {most_db:.2f} dB, on {len(wet):,} vertices; no photo is left to judge it by"
     if wanted == "on":
         reason = f"forced on; {reason}"
     decision = decided("on", reason, gain_db if judged else most_db)
-    return Found(decision, whole, wet, FilmEffect(roughness=roughness), apart)
+    return Found(decision, whole, wet, FilmEffect(roughness=lobes.roughness), lobes.film(ours))
+
+
+def _sharpest(judges: Based, glints: Glints) -> tuple[Lobes, float]:
+    """The sharpest lobes of ``glints`` that predict about as well as any, and what they gain: broader ones
+    also shine in views that no photo had."""
+    trials = [glints.fitted(each) for each in ROUGHNESSES]
+    gains_db = gains_in_other_photos_db(judges, glints.vertex, trials)
+    return next(pair for pair in zip(trials, gains_db, strict=True) if pair[1] >= max(gains_db) - LEAST_DB)
 
 
 def _about(judges: Based, report: Report) -> Samples:

@@ -17,7 +17,7 @@ from scipy.sparse import csr_array
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from endotwin.fit.beneath import APART, Based, Model, decibels, exposure_of
+from endotwin.fit.beneath import Based, Model, decibels, exposure_of
 from endotwin.light import shading
 from endotwin.light.film import Film, mirrored, mirrors_in_view
 from endotwin.pixels.samples import Views
@@ -38,6 +38,9 @@ LEAST_SHARE = 1e-3
 PEAK, PEAK_SPREAD, GLINT_ERROR = 2.0, 3.0, 0.1
 """Prior of a vertex's peak radiance (its median, and the standard deviation of its logarithm), beside the
 error of a glint's display values."""
+
+PRECISION = (GLINT_ERROR / PEAK_SPREAD) ** 2
+"""Of that logarithm, beside squared display values."""
 
 FAINT = 0.02
 """A vertex whose peak radiance is less has no film."""
@@ -67,7 +70,7 @@ class Glints:
     @classmethod
     def of(cls, based: Based, vertex: np.ndarray) -> Glints:
         model, samples = based.model, based.samples
-        mix, row, place = _pairs(based, vertex)
+        mix, row, place = pairs_in(based, vertex)
         half, strength = _mirrors_of(model, samples.views, vertex, row, place)
         near = mix.power(NEARNESS)
         near = (near / near.sum(axis=0)).T.tocsr()
@@ -91,7 +94,7 @@ class Glints:
 
     def _cost(self, film: Tensor) -> Tensor:
         """Half the squared error of each pair, [P], with the radiance [P] of its film."""
-        error = self.shown - shading.respond(self.radiance + film[:, None], self.gamma).clamp(max=1)
+        error, _ = missed(self.shown, self.radiance, film, self.gamma)
         return (error**2).sum(dim=1) / 2
 
     def _total(self, values: Tensor) -> Tensor:
@@ -101,21 +104,17 @@ class Glints:
 
     def fitted(self, roughness: float) -> Lobes:
         """The lobes that show the pairs best: Levenberg–Marquardt, each vertex for itself."""
-        lobes, precision = self._start(roughness), (GLINT_ERROR / PEAK_SPREAD) ** 2
-        middle, damping = lobes.values[:, 2], torch.full((len(self.vertex),), DAMPING)
+        lobes, damping = self._start(roughness), torch.full((len(self.vertex),), DAMPING)
 
         def cost(lobes: Lobes, film: Tensor) -> Tensor:
-            return self._total(self._cost(film)) + precision / 2 * off(lobes) ** 2
-
-        def off(lobes: Lobes) -> Tensor:
-            return torch.nan_to_num(lobes.values[:, 2] - middle)
+            return self._total(self._cost(film)) + PRECISION / 2 * self.off(lobes) ** 2
 
         film, slopes = lobes.linearised(self)
         before = cost(lobes, film)
         for _ in range(STEPS):
             normal, pull = self._normal_equations(film, slopes)
-            normal[:, 2, 2] += precision
-            pull[:, 2] -= precision * off(lobes)
+            normal[:, 2, 2] += PRECISION
+            pull[:, 2] -= PRECISION * self.off(lobes)
             moved = lobes.moved(_damped(normal, pull, damping))
             tried = moved.linearised(self)
             after = cost(moved, tried[0])
@@ -129,15 +128,15 @@ class Glints:
         return lobes
 
     def _normal_equations(self, film: Tensor, slopes: Tensor) -> tuple[Tensor, Tensor]:
-        """JᵀJ [M, 3, 3] and Jᵀe [M, 3] where the pairs' ``film`` [P] has ``slopes`` [P, 3]; a photo that is
-        clipped, and rightly so, pulls at nothing."""
-        x = self.radiance + film[:, None]
-        shown = shading.respond(x, self.gamma)
-        by_film = self.gamma * (shown + shading.RADIANCE_MIN**self.gamma) / (x + shading.RADIANCE_MIN)
-        by_film = by_film * ((shown < 1) | (self.shown < 1))
-        pull = (by_film * (self.shown - shown.clamp(max=1))).sum(dim=1, keepdim=True) * slopes
+        """JᵀJ [M, 3, 3] and Jᵀe [M, 3] where the pairs' ``film`` [P] has ``slopes`` [P, 3]."""
+        error, by_film = missed(self.shown, self.radiance, film, self.gamma)
+        pull = (by_film * error).sum(dim=1, keepdim=True) * slopes
         slopes = by_film.double().norm(dim=1, keepdim=True) * slopes
         return self._total(slopes[:, :, None] * slopes[:, None]), self._total(pull.double())
+
+    def off(self, lobes: Lobes) -> Tensor:
+        """How far ln of the weights is from its prior's mean, [M]; 0 where no guide shines."""
+        return torch.nan_to_num(lobes.values[:, 2] - self.log_weight_of_peak(lobes.roughness))
 
     def log_weight_of_peak(self, roughness: float) -> Tensor:
         """ln of the weight that gives each vertex a peak radiance of PEAK, [M]; −∞ where no guide shines."""
@@ -158,6 +157,15 @@ class Glints:
         return Lobes(axis, values, roughness)
 
 
+def missed(shown: Tensor, radiance: Tensor, film: Tensor, gamma: float) -> tuple[Tensor, Tensor]:
+    """What display values ``shown`` [N, 3] have more than ``radiance`` [N, 3] and a ``film`` [N] give, and
+    their slope by the film, [N, 3]; what is clipped, and rightly so, has none."""
+    x = radiance + film[:, None]
+    given = shading.respond(x, gamma)
+    by_film = gamma * (given + shading.RADIANCE_MIN**gamma) / (x + shading.RADIANCE_MIN)
+    return shown - given.clamp(max=1), by_film * ((given < 1) | (shown < 1))
+
+
 def _damped(normal: Tensor, pull: Tensor, damping: Tensor) -> Tensor:
     """Steps [M, 3] that solve (N + damping·diag N)·step = pull, N [M, 3, 3]; 0 where nothing tells."""
     scale = normal.diagonal(dim1=1, dim2=2).clamp_min(LEAST_TOLD).rsqrt()
@@ -166,7 +174,7 @@ def _damped(normal: Tensor, pull: Tensor, damping: Tensor) -> Tensor:
     return (scale * torch.linalg.solve(scaled, scale * pull)).float()
 
 
-def _pairs(based: Based, vertex: np.ndarray) -> tuple[csr_array, np.ndarray, np.ndarray]:
+def pairs_in(based: Based, vertex: np.ndarray) -> tuple[csr_array, np.ndarray, np.ndarray]:
     """Shares float32 [N, P] in each sample of the pairs of a photo and one of ``vertex``, none less than
     LEAST_SHARE; the photo's row among the views, and the place in ``vertex``, of each pair, ascending, both
     [P].
@@ -276,9 +284,8 @@ class Lobes:
 
 def gains_in_other_photos_db(based: Based, vertex: np.ndarray, trials: Iterable[Lobes]) -> list[float]:
     """What each of the ``trials``, lobes of ``vertex``, gains in the photos that are kept apart."""
-    row = based.samples.views.row(based.samples.frame)
-    apart = based[torch.from_numpy(row % APART == APART // 2)]
-    mix, row, place = _pairs(apart, vertex)
+    apart = based[based.apart]
+    mix, row, place = pairs_in(apart, vertex)
     half, strength = _mirrors_of(based.model, based.samples.views, vertex, row, place)
     glints = Glints(vertex, None, torch.from_numpy(place), half, strength, None, None, None, 0.0)
     films = (torch.from_numpy(mix @ lobes.radiance(glints).numpy())[:, None] for lobes in trials)
