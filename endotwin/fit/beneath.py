@@ -90,7 +90,7 @@ class Based:
     @property
     def apart(self) -> Tensor:
         """Bool [N]: pixels of photos that are kept apart."""
-        return torch.from_numpy(self.samples.views.row(self.samples.frame) % APART == APART // 2)
+        return torch.from_numpy(kept_apart(self.samples.views.row(self.samples.frame)))
 
     @property
     def shines(self) -> Tensor:
@@ -105,6 +105,11 @@ class Based:
         """What explaining every glint would gain."""
         squared = ((self.shown - self.predicted()) ** 2).sum(dim=1).double()
         return decibels(float(squared.sum()), float(squared[~self.shines].sum()))
+
+
+def kept_apart(row: np.ndarray | Tensor) -> np.ndarray | Tensor:
+    """Which photos, of those ``row`` among the views, are kept apart."""
+    return row % APART == APART // 2
 
 
 def exposure_of(samples: Samples) -> Tensor:

@@ -37,11 +37,11 @@ class _Shown(NamedTuple):
 
 def by_pixels(based: Based, glints: Glints, lobes: Lobes) -> Lobes:
     """The lobes that show the pixels ``based`` best, from ``lobes``, which show their means, ``glints``."""
-    mix = pairs_in(based, glints.vertex)[0].astype(np.float64)
-    damping, shown = DAMPING, _shown(based, glints, mix, lobes)
+    mix, photo = pairs_in(based, glints.vertex)[0].astype(np.float64), based.shown
+    damping, shown = DAMPING, _shown(photo, based.radiance, glints, mix, lobes)
     for _ in range(STEPS):
         moved = lobes.moved(_step(glints, mix, lobes, shown, damping))
-        tried = _shown(based, glints, mix, moved)
+        tried = _shown(photo, based.radiance, glints, mix, moved)
         better = tried.cost < shown.cost
         if better:
             lobes, shown = moved, tried
@@ -49,10 +49,11 @@ def by_pixels(based: Based, glints: Glints, lobes: Lobes) -> Lobes:
     return lobes
 
 
-def _shown(based: Based, glints: Glints, mix: csr_array, lobes: Lobes) -> _Shown:
+def _shown(photo: Tensor, radiance: Tensor, glints: Glints, mix: csr_array, lobes: Lobes) -> _Shown:
+    """What ``lobes`` show on ``radiance`` [N, 3] of pixels of the display values ``photo`` [N, 3]."""
     film, slopes = lobes.linearised(glints)
     film = torch.from_numpy(mix @ film.double().numpy()).float()
-    error, by_film = missed(based.shown, based.radiance, film, glints.gamma)
+    error, by_film = missed(photo, radiance, film, glints.gamma)
     cost = (error.double() ** 2).sum() + PRECISION * (glints.off(lobes).double() ** 2).sum()
     return _Shown(slopes, error, by_film, float(cost) / 2)
 

@@ -16,7 +16,7 @@ import numpy as np
 from endotwin.cameras import Camera
 from endotwin.effects import Decision
 from endotwin.effects.film import Film as FilmEffect
-from endotwin.fit.beneath import APART, Based, Model
+from endotwin.fit.beneath import APART, Based, Model, kept_apart
 from endotwin.fit.by_pixels import by_pixels
 from endotwin.fit.glints import Glints, Lobes, gains_in_other_photos_db
 from endotwin.fit.heal import REACH_PX, healed
@@ -73,7 +73,7 @@ def film(model: Model, samples: Samples, wanted: str, report: Report) -> Found:
         judges = whole.based(judges.samples)
     shown = whole.based(_about(judges, report))
     glints = Glints.of(shown, shown.vertices())
-    ours = glints[glints.row % APART != APART // 2]
+    ours = glints[~kept_apart(glints.row)]
     lobes, gain_db = _sharpest(judges, ours)
     judged = len(samples.views.frames) > APART // 2
     if wanted == "auto" and judged and gain_db < LEAST_DB:

@@ -52,8 +52,7 @@ def joint_minimum(
 
     Args:
         basis, image, right: [R, C, 1 + G]: solutions, their products with the matrix, right-hand sides, of
-            which the
-            first is the residual's and the others border the matrix.
+            which the first is the residual's and the others border the matrix.
 
     Returns:
         weights of the basis [1 + G]; shared step [G].
