@@ -316,15 +316,28 @@ def test_conjugate_gradients_solve_all_right_hand_sides_as_a_dense_solver_does()
     right = generator.normal(size=(blocks, channels, 3)) * scale.reshape(blocks, channels, 1)
     diagonal = matrix.reshape(blocks, channels, blocks, channels)[range(blocks), :, range(blocks)]
     as_tensor = torch.from_numpy(matrix)
-    solved = conjugate_gradients(
-        lambda x: (as_tensor @ x.reshape(size, -1)).reshape(x.shape),
-        torch.from_numpy(right),
-        torch.from_numpy(np.linalg.inv(diagonal)),
-    )
+    products = []
+
+    def product(x: torch.Tensor) -> torch.Tensor:
+        products.append(x)
+        return (as_tensor @ x.reshape(size, -1)).reshape(x.shape)
+
+    equations = product, torch.from_numpy(right), torch.from_numpy(np.linalg.inv(diagonal))
     exact = np.linalg.solve(matrix, right.reshape(size, 3))
-    left = solved.numpy().reshape(size, 3) - exact
-    energy = np.sqrt((left * (matrix @ left)).sum(axis=0) / (exact * (matrix @ exact)).sum(axis=0))
-    assert energy.max() < 5e-3
+
+    def error(solved: torch.Tensor) -> float:
+        left = solved.numpy().reshape(size, 3) - exact
+        energy = (left * (matrix @ left)).sum(axis=0) / (exact * (matrix @ exact)).sum(axis=0)
+        return float(np.sqrt(energy.max()))
+
+    solved, image = conjugate_gradients(*equations)
+    assert error(solved) < 5e-3
+    close(image.numpy().reshape(size, 3), matrix @ solved.numpy().reshape(size, 3))
+    cold = len(products)
+    about = torch.from_numpy(3 * exact.reshape(right.shape) * generator.uniform(0.99, 1.01, right.shape))
+    warm, _ = conjugate_gradients(*equations, start=about)
+    assert error(warm) < 5e-3
+    assert len(products) - cold < cold / 2
 
 
 def test_the_joint_step_with_exact_solutions_is_the_solution_of_the_bordered_system():

@@ -49,5 +49,5 @@ class Following:
     def product(self, step: Tensor) -> Tensor:
         """What is more of the normal matrix's product with steps [R, 4, K]."""
         turned = self.turn @ self.whiter(step)
-        pulls = torch.einsum("rcs,rck->sk", self.border, step) + self.inner @ turned
+        pulls = self.border.flatten(0, 1).T @ step.flatten(0, 1) + self.inner @ turned
         return self.border.flatten(0, 1).matmul(turned).reshape(step.shape) + self.right(pulls)

@@ -64,6 +64,10 @@ MOST_BRIGHTER = 1.5
 MOST_GAIN_STEP = 1.0
 """Of the logarithm of a gain: a photo all black or white tells none, and its slope is next to nothing."""
 
+BORDER_TOLERANCE = 1e-2
+"""To which the materials that follow each shared parameter are found: an error of theirs counts squared, and
+they change little from step to step."""
+
 _NO_GAINS = np.zeros(0)
 LENGTHS = (1.0, 0.5, 0.25, 0.1, 0.03)
 """Of the line search, as shares of the full step."""
@@ -112,6 +116,7 @@ class GaussNewton:
         self.held: tuple[str, ...] = ()
         self.errs_by = FIRST_ERROR
         self.solve_s = 0.0
+        self._border: Tensor | None = None
         self.out_of_time = out_of_time
         chosen = drawn(len(samples), SEARCH_SAMPLES, np.random.default_rng(seed))
         self.trial_rows = torch.from_numpy(chosen) if len(chosen) < len(samples) else slice(None)
@@ -329,15 +334,18 @@ class GaussNewton:
         block = equations.lumped() * (link * link.transpose(1, 2)) * scale
         block = (self.squared_adjoint @ block.reshape(len(link), -1)).reshape(-1, CHANNELS, CHANNELS)
         inverse = torch.linalg.inv(block + torch.diag_embed(self.precision))
-        solved = conjugate_gradients(product, right, inverse, self.out_of_time)
-
+        solved, image = conjugate_gradients(product, right[..., :1], inverse, self.out_of_time)
         if not joint:
             return solved[..., 0], torch.zeros_like(state.shared.vector)
+        known = self._border if self._border is not None and self._border.shape[2] == free.shape[1] else None
+        bordering = product, right[..., 1:], inverse, self.out_of_time, known, BORDER_TOLERANCE
+        self._border, border_image = conjugate_gradients(*bordering)
+        solved, image = torch.cat([solved, self._border], dim=2), torch.cat([image, border_image], dim=2)
         mean, precision = self._prior(state, scale)
         pull = (precision * (mean - state.shared.vector)).numpy()
         shared_normal = columns.T @ equations.shared @ columns * scale + free.T @ np.diag(precision) @ free
         shared_right = columns.T @ equations.shared_right * scale + free.T @ pull
-        weights, along = joint_minimum(solved, product(solved), right, shared_normal, shared_right)
+        weights, along = joint_minimum(solved, image, right, shared_normal, shared_right)
         return solved @ self._placed_matrix(weights), torch.from_numpy(free @ along)
 
     def _following(

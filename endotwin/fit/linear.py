@@ -17,29 +17,42 @@ def conjugate_gradients(
     right: Tensor,
     inverse: Tensor,
     out_of_time: Callable[[], bool] = lambda: False,
-) -> Tensor:
+    start: Tensor | None = None,
+    tolerance: float = CG_TOLERANCE,
+) -> tuple[Tensor, Tensor]:
     """Solve for all right-hand sides [R, C, K] at once, preconditioned by blocks ``inverse`` [R, C, C].
 
     Ended early, when ``out_of_time`` says so, it still gives a step that descends.
+
+    Args:
+        start: about what the solutions are, but for a factor each; None: not known.
+        tolerance: ends when all residuals, as the preconditioner measures them, are smaller than right-hand
+            sides by this factor.
+
+    Returns:
+        the solutions and their products with the matrix, [R, C, K].
     """
-    x = torch.zeros_like(right)
-    residual = right.clone()
+    x, residual = torch.zeros_like(right), right.clone()
+    goal = tolerance**2 * (right * (inverse @ right)).sum(dim=(0, 1))
+    if start is not None:
+        image = product(start)
+        length = (start * right).sum(dim=(0, 1)) / (start * image).sum(dim=(0, 1)).clamp_min(1e-30)
+        x, residual = length * start, right - length * image
     z = inverse @ residual
     direction = z.clone()
     energy = (residual * z).sum(dim=(0, 1))
-    goal = CG_TOLERANCE**2 * energy
-    for _ in range(CG_STEPS):
+    for number in range(CG_STEPS):
+        if (energy <= goal).all() or (number and out_of_time()):
+            break
         image = product(direction)
         length = energy / (direction * image).sum(dim=(0, 1)).clamp_min(1e-30)
         x += length * direction
         residual -= length * image
         z = inverse @ residual
         renewed = (residual * z).sum(dim=(0, 1))
-        if (renewed <= goal).all() or out_of_time():
-            break
         direction = z + (renewed / energy.clamp_min(1e-30)) * direction
         energy = renewed
-    return x
+    return x, right - residual
 
 
 def joint_minimum(

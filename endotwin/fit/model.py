@@ -10,6 +10,7 @@ import numpy as np
 import scipy.linalg
 import torch
 from torch import Tensor
+from torch.nn.functional import embedding_bag
 
 from endotwin.effects.coat import Coat
 from endotwin.effects.tone import Tone
@@ -123,8 +124,8 @@ def free_directions(shared: Globals, held: tuple[str, ...]) -> np.ndarray:
 
 def at_pixels(samples: Samples, triangles: Tensor, per_vertex: Tensor) -> Tensor:
     """Vertex values [V, C] interpolated at the samples, [N, C]; ``triangles`` int64 [F, 3]."""
-    corners = per_vertex[triangles[samples.triangle]]
-    return torch.einsum("nk,nkc->nc", samples.barycentric, corners)
+    corners, weights = triangles.index_select(0, samples.triangle), samples.barycentric
+    return embedding_bag(corners, per_vertex, per_sample_weights=weights.to(per_vertex), mode="sum")
 
 
 def radiance(samples: Samples, material: Tensor, shared: Globals) -> Tensor:

@@ -8,6 +8,7 @@ that belongs to it.
 from __future__ import annotations
 
 import math
+from copy import copy
 from dataclasses import dataclass, replace
 from operator import attrgetter
 
@@ -22,6 +23,7 @@ from endotwin.fit.steps import solver_of, started, stepped
 from endotwin.pixels.length_unit import unit_mm
 from endotwin.pixels.samples import Samples, whole_groups
 from endotwin.pixels.start import LIGHT_SPREAD, PRIOR, Start
+from endotwin.run.ahead import on_all_cores
 from endotwin.surface import Surface
 
 SIGMAS = (-1.0, -0.5, 0.0, 0.5, 1.0, 1.5, 2.0)
@@ -56,30 +58,31 @@ def likeliest_n(
 ) -> float:
     """The n beside which the light of ``start``, whose parameters ``held`` stay, leaves least of the
     ``samples`` unexplained, as they look through the ``tone`` curve."""
-    few, effects, unit = _few_of(samples, surface), relighting.effects, unit_mm(surface)
+    few, unit = _few_of(samples, surface), unit_mm(surface)
     solver, operator = solver_of(few, surface, unit, CELL_MM)
     solver.held = ("n", "gamma", *held)
 
     def gone_on(path: _Path, joint: bool) -> _Path:
         """A path after STEPS more, the first of the materials alone unless it is ``joint``."""
-        relighting.effects = path.effects
-        solver.relight(relighting.exposed(few))
-        relighting(solver, path.state)
-        state = path.state
+        own, lighting, state = copy(solver), copy(relighting), path.state
+        lighting.effects = path.effects
+        own.relight(lighting.exposed(few))
+        lighting(own, state)
         for together in (joint, *(True,) * (STEPS - joint)):
-            state, _ = stepped(solver, relighting, state, together)
-        return _Path(state, relighting.effects, solver.noise(state))
+            state, _ = stepped(own, lighting, state, together)
+        return _Path(state, lighting.effects, own.noise(state))
 
-    relighting.keep_light()
-    paths = []
-    for sigma in SIGMAS:
+    def set_out(sigma: float) -> _Path:
         light = replace(start.light, n=PRIOR["n"] + sigma * LIGHT_SPREAD[0] / PRIOR["gamma"])
         state = started(operator, replace(start, light=light), relighting, solver.pattern.told, tone)
-        paths.append(gone_on(_Path(state, effects, math.inf), joint=False))
-    paths = [gone_on(path, joint=True) for path in sorted(paths, key=_LEFT)[:KEPT]]
-    relighting.effects = effects
+        return gone_on(_Path(state, relighting.effects, math.inf), joint=False)
+
+    relighting.keep_light()
+    nearest = sorted(on_all_cores(set_out, SIGMAS), key=_LEFT)[:KEPT]
+    paths = on_all_cores(lambda path: gone_on(path, joint=True), nearest)
+    found = min(paths, key=_LEFT).state.shared.light.n
     relighting.keep_light(False)
-    return min(paths, key=_LEFT).state.shared.light.n
+    return found
 
 
 def _few_of(samples: Samples, surface: Surface) -> Samples:

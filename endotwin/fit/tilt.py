@@ -66,7 +66,7 @@ class Tilter:
         lumped = torch.stack([blocks[i, j] @ ones for i in range(3) for j in range(3)], 1).reshape(-1, 3, 3)
         inverse = torch.linalg.inv(lumped + precision * torch.eye(3))
         right = torch.from_numpy(pattern.vector(right).astype(np.float32) * np.float32(scale))
-        tilt = conjugate_gradients(product, right[..., None], inverse, self.solver.out_of_time)
+        tilt, _ = conjugate_gradients(product, right[..., None], inverse, self.solver.out_of_time)
         return unit(normals + tilt[..., 0].numpy())
 
     def _between(self, normals: np.ndarray, noise: float) -> float:

@@ -38,6 +38,8 @@ MOST_FOLLOWED = 1.0
 
 DARKEST = 1e-30
 
+_SLOPES = (*BOUNCES_BY, "gamma")
+
 
 @dataclass(frozen=True)
 class Albedo:
@@ -222,36 +224,31 @@ class BouncedLight:
         albedo that photos tell of with γ + GAMMA_STEP; None: whatever γ, the albedo is the same. ``by``:
         those of BOUNCES_BY that are to change; each of them takes its time.
         """
-        about, gamma = np.array([n, q, log_scale]), 0.0
-        moved = [(*(about + LIGHT_STEP * (np.array(BOUNCES_BY) == name)), albedo) for name in by]
+        about = {"n": n, "q": q, "scale": log_scale}
+        steps = dict.fromkeys(by, LIGHT_STEP)
+        jobs = [(*about.values(), albedo, gloss is not None)]
+        jobs += [(*(about | {name: about[name] + LIGHT_STEP}).values(), albedo, False) for name in by]
         if seen_by is not None:
-            moved.append((*about, seen_by[1]))
-        jobs = [(*about, albedo, gloss is not None), *((*each, False) for each in moved)]
+            jobs.append((*about.values(), seen_by[1], False))
+            about["gamma"], steps["gamma"] = seen_by[0], GAMMA_STEP
         (here, surroundings), *found = on_all_cores(lambda job: self._expected(places, *job), jobs)
-        changed, by_gamma = [log - here for log, _ in found], np.zeros_like(here)
-        if seen_by is not None:
-            gamma, by_gamma = seen_by[0], changed.pop() / GAMMA_STEP
-        slopes = {name: change / LIGHT_STEP for name, change in zip(by, changed, strict=True)}
-        by_n, by_q, by_scale = (slopes.get(name, np.zeros_like(here)) for name in BOUNCES_BY)
-        by_n, by_q = by_n.mean(axis=1), by_q.mean(axis=1)
-        level = here - (n * by_n + q * by_q)[:, None] - log_scale * by_scale - gamma * by_gamma
-        columns = [
-            torch.from_numpy(np.ascontiguousarray(x, np.float32))
-            for x in (level, by_n, by_q, by_scale, by_gamma)
-        ]
-        if gloss is None:
-            return Bounce(*columns)
-        return Bounce(*columns, gloss, torch.from_numpy(surroundings))
+        slopes = {name: torch.zeros(here.shape[:1] if name in ("n", "q") else here.shape) for name in _SLOPES}
+        level = here
+        for (name, step), (moved, _) in zip(steps.items(), found, strict=True):
+            slope = (moved - here) / step
+            slopes[name] = slope.mean(dim=1) if name in ("n", "q") else slope
+            level = level - about[name] * slopes[name].reshape(len(here), -1)
+        return Bounce(level, *slopes.values(), gloss, surroundings)
 
     def _expected(
         self, places: Places, n: float, q: float, log_scale: float, albedo: Albedo, mirrored: bool
-    ) -> tuple[np.ndarray, np.ndarray | None]:
+    ) -> tuple[Tensor, Tensor | None]:
         """ln of the irradiance of ``places`` [N, 3], and, if it is asked what is ``mirrored`` there, the
         bounce's ``surroundings``."""
         albedo = albedo.scaled(log_scale)
         direct, arriving = self._between(n, q, albedo)
-        irradiance = np.maximum(places.of(arriving[: self._radiosity.count]), DARKEST)
+        irradiance = torch.from_numpy(places.of(arriving[: self._radiosity.count])).float().clamp_min(DARKEST)
         if not mirrored:
-            return np.log(irradiance), None
-        surroundings = places.of(self._mirrored(direct, arriving, albedo)) / irradiance
-        return np.log(irradiance), surroundings.astype(np.float32)
+            return irradiance.log(), None
+        surroundings = torch.from_numpy(places.of(self._mirrored(direct, arriving, albedo))).float()
+        return irradiance.log(), surroundings / irradiance

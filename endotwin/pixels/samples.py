@@ -23,6 +23,7 @@ from endotwin.run.threads import THREADS
 from endotwin.sequence import Frame
 from endotwin.surface import Surface
 from endotwin.surface.casting import Caster, Correspondences
+from endotwin.surface.rows import chosen
 from endotwin.surface.silhouettes import discontinuities
 from endotwin.surface.vectors import unit
 from endotwin.twin import Twin
@@ -92,7 +93,7 @@ class Samples:
         return len(self.triangle)
 
     def __getitem__(self, index) -> Samples:
-        return self._each(lambda value: value[index])
+        return self._each(lambda value: chosen(value, index))
 
     def _each(self, change: Callable) -> Samples:
         """The samples with every column changed."""
