@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from scipy.sparse import csr_array, diags_array
-from scipy.sparse.linalg import cg
+from scipy.sparse.linalg import LinearOperator, cg
 from torch import Tensor
 
 from endotwin.fit.beneath import Based
@@ -66,13 +66,18 @@ def _step(glints: Glints, mix: csr_array, lobes: Lobes, shown: _Shown, damping: 
         (shown.slopes.double().numpy().ravel(), column.ravel(), np.arange(0, 3 * pairs + 1, 3)),
         shape=(pairs, count),
     )
-    jacobian = diags_array(shown.by_film.double().norm(dim=1).numpy()) @ mix @ by_values
+    weight = (shown.by_film.double() ** 2).sum(dim=1).numpy()
     pull = by_values.T @ (mix.T @ (shown.by_film * shown.error).double().sum(dim=1).numpy())
     prior = np.zeros(count)
     prior[2::3] = PRECISION
     pull[2::3] -= PRECISION * glints.off(lobes).double().numpy()
-    normal = (jacobian.T @ jacobian).tocsr()
-    diagonal = np.maximum((1 + damping) * (normal.diagonal() + prior), LEAST_TOLD)
-    normal = normal + diags_array(diagonal - normal.diagonal())
+    told = by_values.power(2).T @ (mix.power(2).T @ weight)  # a pixel has but one pair of each vertex
+    diagonal = np.maximum((1 + damping) * (told + prior), LEAST_TOLD)
+
+    def product(step: np.ndarray) -> np.ndarray:
+        film = weight * (mix @ (by_values @ step))
+        return by_values.T @ (mix.T @ film) + (diagonal - told) * step
+
+    normal = LinearOperator((count, count), product, dtype=np.float64)
     step, _ = cg(normal, pull, rtol=SOLVED, maxiter=PRODUCTS, M=diags_array(1 / diagonal))
     return torch.from_numpy(step.reshape(-1, 3)).float()
