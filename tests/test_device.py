@@ -15,7 +15,7 @@ from endotwin.fit import endopbr, normal_equations
 from endotwin.fit.gauss_newton import GaussNewton
 from endotwin.fit.hashgrid import HashGrid, corner_slots, level_slots
 from endotwin.fit.model import linearise, predict
-from endotwin.fit.normal_equations import add_products, pairs_of, sum_products
+from endotwin.fit.normal_equations import add, each_product, pairs_of, summed_products
 from endotwin.run import threads
 
 NOWHERE = torch.device("meta")
@@ -44,11 +44,11 @@ def test_slots_of_all_levels_on_a_device_are_those_of_each_level():
 
 def test_products_are_summed_alike_by_index_and_by_sparse_matrix():
     generator = np.random.default_rng(1)
-    ids = np.sort(generator.integers(0, 50, 2000))
-    left, right = (generator.normal(size=(2000, width)).astype(np.float32) for width in (6, 7))
-    by_matrix, by_index = np.zeros((50, 6, 7), np.float32), torch.zeros(50, 6, 7, device=GPU)
-    add_products(by_matrix, ids, left, right)
-    sum_products(by_index, *(torch.from_numpy(x).to(GPU) for x in (ids, left, right)))
+    ids = torch.from_numpy(np.sort(generator.integers(0, 50, 2000)))
+    left, right = (torch.from_numpy(generator.normal(size=(2000, width))).float() for width in (6, 7))
+    by_matrix, by_index = torch.zeros(50, 6, 7), torch.zeros(50, 6, 7, device=GPU)
+    add(by_matrix, summed_products(ids, left, right))
+    add(by_index, each_product(*(x.to(GPU) for x in (ids, left, right))))
     np.testing.assert_allclose(by_index.cpu(), by_matrix, atol=1e-4)
 
 
@@ -77,7 +77,7 @@ def test_model_and_its_derivatives_are_made_where_the_samples_are(photographed):
     assert {predict(far, material, state.shared).device, model.by_globals.device} == {NOWHERE}
     sums = torch.zeros(7, 6, 7, device=NOWHERE)
     ids = torch.zeros(len(samples), dtype=torch.int64, device=NOWHERE)
-    sum_products(sums, ids, pairs_of(far.barycentric), torch.rand(len(samples), 7, device=NOWHERE))
+    add(sums, summed_products(ids, pairs_of(far.barycentric), torch.rand(len(samples), 7, device=NOWHERE)))
     assert far.to(NOWHERE) is far and samples.to(torch.device("cpu")) is samples
 
 
@@ -85,8 +85,8 @@ def test_a_step_as_a_gpu_sums_it_ends_where_that_of_the_cpu_does(photographed, m
     twin, samples, state = photographed
     darker = replace(state, mean=state.mean * 0.9)
     ends = []
-    for add in (normal_equations._add, sum_products):
-        monkeypatch.setattr(normal_equations, "_add", add)
+    for products in (summed_products, each_product):
+        monkeypatch.setattr(normal_equations, "summed_products", products)
         solver = GaussNewton(samples, twin.surface.triangles, state.operator, device=GPU)
         for joint in (False, True):
             moved, gain, _ = solver.step(darker, joint)

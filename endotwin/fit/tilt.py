@@ -17,7 +17,7 @@ from endotwin.effects import Effects
 from endotwin.fit.gauss_newton import HUBER, TEMPER, GaussNewton
 from endotwin.fit.linear import conjugate_gradients
 from endotwin.fit.model import at_pixels, displayed, glow, radiance
-from endotwin.fit.normal_equations import CHUNK, Residual, add_products, pairs_of
+from endotwin.fit.normal_equations import CHUNK, Part, Residual, add, pairs_of, summed_products
 from endotwin.fit.state import State
 from endotwin.light.guides import Incoming
 from endotwin.light.incidence import COS_MIN
@@ -94,23 +94,24 @@ class Tilter:
             JᵀWJ float32 [T, 6, 6] by CORNER_PAIRS and AXIS_PAIRS; JᵀWe float32 [T, 3, 3] by corner and axis.
         """
         samples, pattern = self.solver.samples, self.solver.pattern
-        count = len(pattern.corners)
-        sums, right = np.zeros((count, 6, 6), np.float32), np.zeros((count, 3, 3), np.float32)
+        sums, right = (torch.zeros(len(pattern.corners), *shape) for shape in ((6, 6), (3, 3)))
+        every_id = torch.from_numpy(pattern.compact)
 
-        def one(part: Samples) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        def one(rows: slice) -> tuple[Part, Part]:
+            part, ids = samples[rows], every_id[rows]
             axis, slope, residual = self._slopes(part, normals, HUBER * noise)
+            axis = torch.from_numpy(axis)
             certain = residual.weight / (1 + (slope * (between / noise)) ** 2)
-            weight = (certain * slope * slope).sum(dim=1).numpy()
-            pull = (certain * slope * residual.error).sum(dim=1).numpy()
-            along = np.stack([weight * axis[:, i] * axis[:, j] for i, j in AXIS_PAIRS], axis=1)
-            return part.barycentric.numpy(), along, pull[:, None] * axis
+            weight = (certain * slope * slope).sum(dim=1)
+            pull = (certain * slope * residual.error).sum(dim=1)
+            along = torch.stack([weight * axis[:, i] * axis[:, j] for i, j in AXIS_PAIRS], dim=1)
+            pairs = summed_products(ids, pairs_of(part.barycentric), along)
+            return pairs, summed_products(ids, part.barycentric, pull[:, None] * axis)
 
-        parts = on_all_cores(one, samples.chunks(CHUNK))
-        for start, (corner, along, pulled) in zip(range(0, len(samples), CHUNK), parts, strict=True):
-            ids = pattern.compact[start : start + len(corner)]
-            add_products(sums, ids, pairs_of(corner), along)
-            add_products(right, ids, corner, pulled)
-        return sums, right
+        for pairs, pulls in on_all_cores(one, [slice(k, k + CHUNK) for k in range(0, len(samples), CHUNK)]):
+            add(sums, pairs)
+            add(right, pulls)
+        return sums.numpy(), right.numpy()
 
     def _slopes(
         self, samples: Samples, normals: np.ndarray, width: float
