@@ -63,7 +63,7 @@ def test_exposure_scales_all_light():
 @pytest.mark.parametrize("coat", [None, Coat(0.6, 0.2), Coat(0.6, 0.2, tail=1.0)])
 @pytest.mark.parametrize("tone", [None, Tone(0.4)])
 def test_the_derivatives_of_least_squares_are_those_of_automatic_differentiation(scene, coat, tone):
-    """By base colour, roughness, coat and, at the displayed colour b^γ, by γ·ln L0, γn, γq, γ and ln f0."""
+    """By base colour, roughness, coat and, at the displayed colour b^γ, by what all pixels share."""
     samples = test_model.SCENES[scene](test_model.made_samples(40, 17))
     material, shared = test_model.made_materials(40), replace(test_model.shared_of(scene), coat=coat)
     shared = replace(shared, tone=tone)
@@ -72,12 +72,15 @@ def test_the_derivatives_of_least_squares_are_those_of_automatic_differentiation
 
     def predicted(vector, roughness, weight):
         log_L0, n, q = vector[:3] / vector[3]
-        scale = vector[5] if len(vector) > 5 else 0.0
+        scale = vector[-1] if shared.bounces else 0.0
         lobes = Lobes(
             torch.exp(vector[4]), coat=None if coat is None else (weight, coat.roughness, coat.tail)
         )
         color = shown ** (1 / vector[3])
         lit = samples.lit(n, q, scale, vector[3])
+        if shared.vignettes:
+            exposed = 0.0 if lit.log_exposure is None else lit.log_exposure
+            lit = replace(lit, log_exposure=exposed + vector[5] / vector[3] * samples.radius2)
         if samples.bounce is not None and samples.bounce.shown is not None:
             followed = samples.bounce.followed(torch.log(color), vector[3])
             lit = replace(lit, irradiance=lit.irradiance * followed)

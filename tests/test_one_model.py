@@ -29,7 +29,7 @@ GUIDES = Offset(((3.2, 0.5, 0.0), (-2.8, 2.7, 0.0)))
 SCENES = {
     "light": [],
     "gain": [Gain((0, 1), (-0.2, 0.2))],
-    "vignetting": [Vignetting(-0.5, -0.1)],
+    "vignetting": [Vignetting(-0.5)],
     "profile": [Profile(0.7)],
     "offset and shadows": [GUIDES, Shadows()],
     "interreflection": [Interreflection(4.0)],
@@ -40,7 +40,7 @@ SCENES = {
         Shadows(),
         Interreflection(4.0),
         Gain((0, 1), (-0.2, 0.2)),
-        Vignetting(-0.5, -0.1),
+        Vignetting(-0.5),
         Profile(0.7),
         Coat(0.8, 0.15),
         Tone(0.3),
@@ -61,7 +61,8 @@ def seen_by_the_fit(tube: Twin, effects: Effects) -> tuple[GaussNewton, State]:
     """The tube's pixels under ``effects`` as the fit has them, and what it would fit."""
     samples, state = tube_twin.photographed(tube, tube.camera, POSES), tube_twin.state_of(tube)
     shared = Globals.of(tube.light, tube.response, tube.materials.f0, bounce=bool(effects.bounce))
-    state = replace(state, shared=replace(shared, coat=effects.get("coat"), tone=effects.get("tone")))
+    shared = replace(shared, coat=effects.get("coat"), tone=effects.get("tone"))
+    state = replace(state, shared=shared.behind(effects.get("vignetting")))
     return tube_twin.seen_by_the_fit(tube, samples, state, effects), state
 
 

@@ -27,7 +27,7 @@ from endotwin.light.forward import Lit
 from endotwin.light.guides import AT_LENS, COSINE, guided, log_axis
 from endotwin.pixels.fixed_effects import Design, FixedEffects, Left, pseudo_huber, regress
 from endotwin.pixels.samples import Samples, whole_groups
-from endotwin.pixels.start import LIGHT_MEAN, LIGHT_SPREAD, PRIOR, dark, diffuse
+from endotwin.pixels.start import LIGHT_MEAN, LIGHT_SPREAD, PRIOR, VIGNETTING_SPREAD, dark, diffuse
 
 if TYPE_CHECKING:
     from endotwin.surface.casting import Caster
@@ -37,13 +37,10 @@ PIXELS = 24_000
 LEAST_PIXELS = 4
 """A vertex takes part if so many pixels show it: one gives its albedo, the others judge."""
 
-VIGNETTING_SPREAD = 0.1
-"""Prior standard deviation of γ·k2 about 0. Like that of γn, γq and γ it counts against one
-observation a vertex: what the model lacks errs alike in all pixels of one."""
-
 TISSUE_SPREAD = (0.7, 0.7, 0.1)
 """Prior of the tissue's answer to light, see ``Tissue``: from Lambert's lobe to one rougher than usual; f0
-and albedo of half or twice what they mostly are."""
+and albedo of half or twice what they mostly are. Like that of γn, γq, γ and γ·k2 it counts against one
+observation a vertex: what the model lacks errs alike in all pixels of one."""
 
 ALBEDO_RANGE = 5.0
 """Albedos are told to within this factor of the median: enough for how much their lobes stand out."""

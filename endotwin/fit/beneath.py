@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from endotwin.fit.lighting import Relighting, lit
-from endotwin.fit.model import at_pixels, radiance
+from endotwin.fit.model import at_pixels, log_exposure, radiance
 from endotwin.fit.state import State
 from endotwin.light import shading
 from endotwin.light.film import Film, film_in_view
@@ -56,7 +56,12 @@ class Model:
         more = self.guides_mm, effects.profile, self.state.shared.log_light, caster
         glow = film_in_view(film, roughness, surface.vertices_mm, samples.views.T_local_camera[row], *more)
         corners = torch.from_numpy(glow[surface.triangles[samples.triangle.numpy()]])
-        return (samples.barycentric * corners).sum(dim=1, keepdim=True) * exposure_of(samples)
+        return (samples.barycentric * corners).sum(dim=1, keepdim=True) * self.exposure(samples)
+
+    def exposure(self, samples: Samples) -> Tensor:
+        """Gain and vignetting, [N, 1], or [1, 1] of 1."""
+        log_factor = log_exposure(samples, self.state.shared)
+        return torch.ones(1, 1) if log_factor is None else log_factor.exp()[:, None]
 
     def based(self, samples: Samples) -> Based:
         """``samples``, which the guides light, with what the model shows there."""
@@ -110,11 +115,6 @@ class Based:
 def kept_apart(row: np.ndarray | Tensor) -> np.ndarray | Tensor:
     """Which photos, of those ``row`` among the views, are kept apart."""
     return row % APART == APART // 2
-
-
-def exposure_of(samples: Samples) -> Tensor:
-    """Gain and vignetting, [N, 1], or [1, 1] of 1."""
-    return torch.ones(1, 1) if samples.log_exposure is None else samples.log_exposure.exp()[:, None]
 
 
 def decibels(before: float, after: float) -> float:

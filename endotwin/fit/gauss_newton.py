@@ -130,7 +130,7 @@ class GaussNewton:
         self._known: tuple[State, Tensor] | None = None
 
     def _global_prior(self, state: State) -> tuple[Tensor, Tensor]:
-        return global_prior(self._unit_mm, len(state.shared.vector))
+        return global_prior(self._unit_mm, state.shared)
 
     def _here(self, state: State) -> State:
         """``state`` on the device, where it is a table of this operator."""

@@ -17,7 +17,7 @@ from scipy.sparse import csr_array
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from endotwin.fit.beneath import Based, Model, decibels, exposure_of
+from endotwin.fit.beneath import Based, Model, decibels
 from endotwin.light import shading
 from endotwin.light.film import Film, mirrored, mirrors_in_view
 from endotwin.pixels.samples import Views
@@ -74,7 +74,7 @@ class Glints:
         half, strength = _mirrors_of(model, samples.views, vertex, row, place)
         near = mix.power(NEARNESS)
         near = (near / near.sum(axis=0)).T.tocsr()
-        shown = exposure_of(samples).expand(len(samples), 1), based.shown, based.radiance
+        shown = model.exposure(samples).expand(len(samples), 1), based.shown, based.radiance
         means = [torch.from_numpy(near @ each.numpy()) for each in shown]
         return cls(
             vertex,
@@ -291,6 +291,6 @@ def gains_in_other_photos_db(based: Based, vertex: np.ndarray, trials: Iterable[
     films = (torch.from_numpy(mix @ lobes.radiance(glints).numpy())[:, None] for lobes in trials)
     before, *after = (
         float(((apart.shown - apart.predicted(film)) ** 2).sum())
-        for film in (0.0, *(film * exposure_of(apart.samples) for film in films))
+        for film in (0.0, *(film * based.model.exposure(apart.samples) for film in films))
     )
     return [decibels(before, each) for each in after]

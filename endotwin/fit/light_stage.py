@@ -154,7 +154,7 @@ class LightStage:
         self._solver, operator = solver_of(samples, surface, self._unit_mm, CELL_MM, **options)
         set_up = pace.stopwatch.total
         if self._goes_on:
-            shared = replace(before.state.shared, tone=tone)
+            shared = replace(before.state.shared, tone=tone).behind(relighting.effects.get("vignetting"))
             self._state = replace(before.state, operator=operator, shared=shared)
         else:
             self._state = started(operator, start, relighting, self._solver.pattern.told, tone)
@@ -207,7 +207,7 @@ class LightStage:
                 number, near = 0, False
             shared = self._judged(near)
             holding = number < HOLD_STEPS and not self._goes_on
-            held = ("n", "gamma") if holding else self._undetermined
+            held = ("n", "gamma", "k2") if holding else self._undetermined
             self._solver.held = (*held, *BOUNCE_HELD)
             on_trial = self._bare is not None
             gain = self._step_coated(shared) if shared.coat else self._step(joint=True)

@@ -13,6 +13,7 @@ from torch import Tensor
 from endotwin.effects import Effects
 from endotwin.effects.gain import Gain
 from endotwin.effects.offset import Offset
+from endotwin.effects.vignetting import squared_radius
 from endotwin.fit.faint import NOTHING, Faint
 from endotwin.fit.gauss_newton import HUBER, MOST_GAIN_STEP, GaussNewton
 from endotwin.fit.model import Globals, at_pixels, slope_by_log_exposure
@@ -42,19 +43,16 @@ def lit(samples: Samples, surface: Surface, caster: Caster, effects: Effects) ->
 
 
 def exposed(samples: Samples, effects: Effects) -> Samples:
-    """``samples`` with the gain and vignetting of ``effects``, if there are any."""
-    return replace(samples, log_exposure=_log_exposure(samples, effects))
-
-
-def _log_exposure(samples: Samples, effects: Effects) -> Tensor | None:
-    if "gain" not in effects and "vignetting" not in effects:
-        return None
-    exposure = np.ones(len(samples), np.float32)
+    """``samples`` with the gain of ``effects``, if there is any, and where in the lens's picture they lie, if
+    it vignettes."""
+    gain = radius2 = None
     if "gain" in effects:
-        exposure *= effects["gain"].of(samples.frame.numpy())
+        gain = torch.from_numpy(np.log(effects["gain"].of(samples.frame.numpy())))
     if "vignetting" in effects:
-        exposure *= effects["vignetting"].transmission(samples.views.camera, samples.pixel.numpy())
-    return torch.from_numpy(np.log(exposure))
+        radius2 = samples.radius2
+        if radius2 is None:
+            radius2 = torch.from_numpy(squared_radius(samples.views.camera, samples.pixel.numpy()))
+    return replace(samples, log_exposure=gain, radius2=radius2)
 
 
 def _guided(samples: Samples, surface: Surface, caster: Caster, effects: Effects) -> Guided:

@@ -14,6 +14,7 @@ from torch.nn.functional import embedding_bag
 
 from endotwin.effects.coat import Coat
 from endotwin.effects.tone import Tone
+from endotwin.effects.vignetting import Vignetting
 from endotwin.light import forward, shading
 from endotwin.light.forward import Lit, Lobes
 from endotwin.pixels.samples import Samples
@@ -24,13 +25,15 @@ GLOBALS = ("gamma·ln L0", "gamma·n", "gamma·q", "gamma", "ln f0")
 
 GAMMA, F0 = (GLOBALS.index(name) for name in ("gamma", "ln f0"))
 
-BOUNCE_GLOBALS = (*GLOBALS, "ln albedo scale")
-"""With interreflection there is one more: it tells how bright the tissue is beside the light."""
+EVERY_GLOBAL = (*GLOBALS, "gamma·k2", "ln albedo scale")
+"""Behind a lens that vignettes there is one more, since light of another n passes for most of that; and with
+interreflection another: it tells how bright the tissue is beside the light."""
 
 
 @dataclass(frozen=True)
 class Globals:
-    """What all pixels share, as one vector float64 [5] in the order of GLOBALS, or [6] of BOUNCE_GLOBALS.
+    """What all pixels share, as one vector float64 [G]: GLOBALS, and those of EVERY_GLOBAL that a scene calls
+    for.
 
     Without ``specular`` there is no specular lobe, and ln f0 stays where it is. A ``coat`` adds a lobe of its
     own; a ``tone`` bends what x^γ displays. ``tissue`` [3] is the mean of ln of the base colours that bounced
@@ -42,6 +45,7 @@ class Globals:
     coat: Coat | None = None
     tone: Tone | None = None
     tissue: Tensor | None = None
+    vignettes: bool = False
 
     @classmethod
     def of(
@@ -50,6 +54,12 @@ class Globals:
         gamma = response.gamma
         values = [gamma * math.log(light.L0), gamma * light.n, gamma * light.q, gamma, math.log(f0)]
         return cls(torch.tensor(values + [0.0] * bounce, dtype=torch.float64), specular)
+
+    def behind(self, lens: Vignetting | None) -> Globals:
+        """The same behind a ``lens`` that vignettes by its k2; None: that does not vignette."""
+        rest = [torch.tensor([self.gamma * lens.k2], dtype=torch.float64)] if lens else []
+        bare, scale = self.vector[: len(GLOBALS)], self.vector[len(GLOBALS) + self.vignettes :]
+        return replace(self, vector=torch.cat([bare, *rest, scale]), vignettes=lens is not None)
 
     @property
     def log_light(self) -> tuple[float, float, float]:
@@ -75,17 +85,28 @@ class Globals:
 
     def without_scale(self) -> Globals:
         """The same without interreflection."""
-        return replace(self, vector=self.vector[: len(GLOBALS)])
+        return replace(self, vector=self.vector[: len(GLOBALS) + self.vignettes])
 
     @property
     def bounces(self) -> bool:
         """Whether light bounces between tissue."""
-        return len(self.vector) > len(GLOBALS)
+        return len(self.vector) > len(GLOBALS) + self.vignettes
+
+    @property
+    def k2(self) -> float:
+        """Of the lens's vignetting; 0 without any."""
+        return float(self.vector[len(GLOBALS)]) / self.gamma if self.vignettes else 0.0
+
+    @property
+    def places(self) -> list[int]:
+        """Of the parameters in EVERY_GLOBAL, [G]."""
+        there = [True] * len(GLOBALS) + [self.vignettes, self.bounces]
+        return [place for place, is_there in enumerate(there) if is_there]
 
     @property
     def log_scale(self) -> float:
         """ln of the factor on all albedo; 0 without interreflection."""
-        return float(self.vector[5]) if self.bounces else 0.0
+        return float(self.vector[-1]) if self.bounces else 0.0
 
     @property
     def bouncing(self) -> tuple[float, float, float, float]:
@@ -95,31 +116,31 @@ class Globals:
 
 def columns_of(shared: Globals, bordered: bool) -> np.ndarray:
     """What the columns of ``Linearised.by_shared`` are of the shared parameters, [columns, G]."""
-    plain = np.eye(len(GLOBALS), len(shared.vector))[: len(GLOBALS) * bordered]
-    scale = np.eye(len(shared.vector))[len(GLOBALS) :]
-    return np.concatenate([plain, *[scale] * 3])
+    alone = len(shared.vector) - shared.bounces
+    plain, scale = np.split(np.eye(len(shared.vector)), [alone])
+    return np.concatenate([plain[: alone * bordered], *[scale] * 3])
 
 
 def free_directions(shared: Globals, held: tuple[str, ...]) -> np.ndarray:
-    """Steps of the shared parameters that keep those named in ``held`` (L0, n, q, gamma, f0, albedo scale,
-    or the level γ·ln L0, with which displayed base colours stay): a basis [G, K].
+    """Steps of the shared parameters that keep those named in ``held`` (L0, n, q, gamma, f0, k2, albedo
+    scale, or the level γ·ln L0, with which displayed base colours stay): a basis [G, K].
 
     The light is fitted as γ·ln L0, γ·n and γ·q: γn − n·γ = 0 keeps n while γ moves.
     """
     log_L0, n, q = shared.log_light
     kept = {
-        "L0": [1, 0, 0, -log_L0, 0, 0],
-        "level": [1, 0, 0, 0, 0, 0],
-        "n": [0, 1, 0, -n, 0, 0],
-        "q": [0, 0, 1, -q, 0, 0],
-        "gamma": [0, 0, 0, 1, 0, 0],
-        "f0": [0, 0, 0, 0, 1, 0],
-        "albedo scale": [0, 0, 0, 0, 0, 1],
+        "L0": [1, 0, 0, -log_L0, 0, 0, 0],
+        "level": [1, 0, 0, 0, 0, 0, 0],
+        "n": [0, 1, 0, -n, 0, 0, 0],
+        "q": [0, 0, 1, -q, 0, 0, 0],
+        "gamma": [0, 0, 0, 1, 0, 0, 0],
+        "f0": [0, 0, 0, 0, 1, 0, 0],
+        "k2": [0, 0, 0, -shared.k2, 0, 1, 0],
+        "albedo scale": [0, 0, 0, 0, 0, 0, 1],
     }
-    count = len(shared.vector)
     if not held:
-        return np.eye(count)
-    return scipy.linalg.null_space(np.array([kept[name][:count] for name in held]))
+        return np.eye(len(shared.vector))
+    return scipy.linalg.null_space(np.array([kept[name] for name in held])[:, shared.places])
 
 
 def at_pixels(samples: Samples, triangles: Tensor, per_vertex: Tensor) -> Tensor:
@@ -142,9 +163,19 @@ def glow(samples: Samples, material: Tensor, shared: Globals) -> Tensor | float:
     return forward.glow(_lit(samples, material[:, :3], shared), shared.log_light, material[:, :3])
 
 
+def log_exposure(samples: Samples, shared: Globals) -> Tensor | None:
+    """ln of gain and vignetting at the samples, [N]; None: 0."""
+    if not shared.vignettes:
+        return samples.log_exposure
+    passed = shared.k2 * samples.radius2
+    return passed if samples.log_exposure is None else samples.log_exposure + passed
+
+
 def _lit(samples: Samples, base_color: Tensor, shared: Globals) -> Lit:
     """What lights the samples, where light bounced off tissue of ``base_color`` [N, 3]."""
     lit, bounce = samples.lit(*shared.bouncing), samples.bounce
+    if shared.vignettes:
+        lit = replace(lit, log_exposure=log_exposure(samples, shared))
     if bounce is None or bounce.shown is None:
         return lit
     factor = bounce.followed(torch.log(base_color), shared.gamma, shared.tissue)
@@ -179,7 +210,7 @@ class Linearised:
 
     Attributes:
         predicted: [N, 3]. by_color: dC/db [N, 3] (each channel by its own base colour).
-        by_roughness: dC/dr [N, 3]. by_globals: dC by the shared parameters, [N, 3, 5 or 6].
+        by_roughness: dC/dr [N, 3]. by_globals: dC by the shared parameters, [N, 3, G].
         by_coat: dC by the coat's weight, [N, 3]; None: there is no coat.
     """
 
@@ -189,11 +220,11 @@ class Linearised:
     by_globals: Tensor
     by_coat: Tensor | None
 
-    def by_shared(self, bordered: bool) -> Tensor:
-        """dC by the shared parameters, if the equations are ``bordered`` by them, with the albedo's scale
-        apart for each channel: [N, 3, G]."""
-        count = len(GLOBALS)
-        plain, scale = self.by_globals[..., : count * bordered], self.by_globals[..., count:]
+    def by_shared(self, shared: Globals, bordered: bool) -> Tensor:
+        """dC by the ``shared`` parameters, if the equations are ``bordered`` by them, with the albedo's scale
+        apart for each channel: [N, 3, columns]."""
+        alone = len(shared.vector) - shared.bounces
+        plain, scale = self.by_globals[..., : alone * bordered], self.by_globals[..., alone:]
         return torch.cat([plain, torch.diag_embed(scale[..., 0])], dim=2) if scale.shape[2] else plain
 
     def toned(self, tone: Tone | None) -> Linearised:
@@ -246,13 +277,19 @@ def linearise(samples: Samples, material: Tensor, shared: Globals) -> Linearised
     floor = math.exp(gamma * log_floor)
     by_color = slope * per_color
     by_light = slope / gamma
-    by_gamma = power * log_x - floor * log_floor - by_light * (log_L0 * x + n * axis - q * distance)
+    told = log_L0 * x + n * axis - q * distance
+    by_k2 = []
+    if shared.vignettes:
+        passed = samples.radius2[:, None] * x
+        told, by_k2 = told + shared.k2 * passed, [by_light * passed]
+    by_gamma = power * log_x - floor * log_floor - by_light * told
     by_gamma = by_gamma - by_color * base_color * torch.log(base_color) / gamma
     if samples.bounce is not None:
         by_gamma = by_gamma + slope * glow * samples.bounce.by_gamma
         if samples.bounce.shown is not None:
             by_color = by_color + slope * glow * samples.bounce.following / base_color
     by_globals = [by_light * x, by_light * axis, -by_light * distance, by_gamma, slope * shine[:, None]]
+    by_globals += by_k2
     if samples.bounce is not None:
         by_globals.append(slope * glow * samples.bounce.by_scale)
     return Linearised(

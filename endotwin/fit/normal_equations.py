@@ -222,7 +222,7 @@ class _Products:
         products = [weighted_color[:, c] * model.by_color[:, c] for c in range(3)]
         products += [weighted_color[:, c] * by_roughness[:, c] for c in range(3)]
         products.append((weighted_roughness * by_roughness).sum(dim=1))
-        slopes = model.by_shared(bordered)
+        slopes = model.by_shared(shared, bordered)
         against = torch.cat([residual.error[..., None], slopes], dim=2)
         by_color = weighted_color[..., None] * against
         by_all = (weighted_roughness[..., None] * against).sum(dim=1, keepdim=True)

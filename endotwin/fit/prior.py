@@ -11,7 +11,7 @@ from endotwin.fit.hashgrid import HashOperator
 from endotwin.fit.model import Globals
 from endotwin.fit.state import GLOBAL_RANGE, ROUGHNESS_RANGE
 from endotwin.light.shading import F0_DIELECTRIC
-from endotwin.pixels.start import LIGHT_MEAN, LIGHT_SPREAD, PRIOR
+from endotwin.pixels.start import LIGHT_MEAN, LIGHT_SPREAD, PRIOR, VIGNETTING_SPREAD
 
 COLOR_SPREAD = 0.5
 ROUGHNESS_LOGIT_SPREAD = 0.1 * 4 / (ROUGHNESS_RANGE[1] - ROUGHNESS_RANGE[0])
@@ -19,9 +19,9 @@ ROUGHNESS_LOGIT_SPREAD = 0.1 * 4 / (ROUGHNESS_RANGE[1] - ROUGHNESS_RANGE[0])
 
 COARSE_MM = 12.0
 
-GLOBAL_MEAN = (0.0, *LIGHT_MEAN, math.log(F0_DIELECTRIC), 0.0)
-GLOBAL_SPREAD = (5.0, *LIGHT_SPREAD, 0.5, 0.5)
-"""Prior of the shared parameters, in the order of BOUNCE_GLOBALS."""
+GLOBAL_MEAN = (0.0, *LIGHT_MEAN, math.log(F0_DIELECTRIC), 0.0, 0.0)
+GLOBAL_SPREAD = (5.0, *LIGHT_SPREAD, 0.5, VIGNETTING_SPREAD, 0.5)
+"""Prior of the shared parameters, in the order of EVERY_GLOBAL."""
 
 USUAL_SIGMAS = 3.0
 AT_EDGE = 0.01
@@ -37,11 +37,11 @@ def prior_precision(operator: HashOperator, unit_mm: float) -> Tensor:
     return torch.stack([color, color, color, roughness], dim=1)
 
 
-def global_prior(unit_mm: float, count: int) -> tuple[Tensor, Tensor]:
-    """Mean and standard deviation of ``count`` shared parameters; L0 is the light at a distance of 1 mm,
+def global_prior(unit_mm: float, shared: Globals) -> tuple[Tensor, Tensor]:
+    """Mean and standard deviation of the ``shared`` parameters; L0 is the light at a distance of 1 mm,
     but its prior that at 1 unit."""
     mean, spread = (
-        torch.tensor(values[:count], dtype=torch.float64) for values in (GLOBAL_MEAN, GLOBAL_SPREAD)
+        torch.tensor(values, dtype=torch.float64)[shared.places] for values in (GLOBAL_MEAN, GLOBAL_SPREAD)
     )
     mean[0] += mean[2] * math.log(unit_mm)
     return mean, spread

@@ -24,7 +24,7 @@ from scipy.special import exp1, xlogy
 from endotwin.cameras.base import solid_angle
 from endotwin.effects import Decision
 from endotwin.effects.sparkle import Sparkle
-from endotwin.fit.beneath import APART, GLINT, Model, exposure_of
+from endotwin.fit.beneath import APART, GLINT, Model
 from endotwin.fit.film import Found as FoundFilm
 from endotwin.fit.film import Report
 from endotwin.fit.heal import REACH_PX
@@ -182,7 +182,9 @@ class _Places(Rows):
         cos_o = dot(normals, unit(-points_mm)).clip(1e-3, 1)
         cos_i = samples.cos[:, None] if samples.guides is None else samples.guides.cos_i
         seen_mm2 = dot(points_mm, points_mm) * solid_angle(samples.views.camera, _uv(samples))
-        gain = strength.numpy() * cos_i.numpy() * (cos_o / seen_mm2)[:, None] * exposure_of(samples).numpy()
+        gain = (
+            strength.numpy() * cos_i.numpy() * (cos_o / seen_mm2)[:, None] * model.exposure(samples).numpy()
+        )
         gain = shading.F0_WATER * gain / cos_m**4
         corners = model.twin.surface.triangles[samples.triangle.numpy()]
         wet = np.ones(len(index), bool) if film is None else film.wets(corners)

@@ -21,8 +21,11 @@ COLOR_RANGE = (1e-3, 100.0)
 """Of base colour before light and albedo share their scale: so far from where a fit may go that nothing stops
 at the clamp, beyond which no step finds a lower cost."""
 
-GLOBAL_RANGE = ((-20.0, 20.0), (0.0, 10.0), (0.0, 4.0), (0.15, 1.5), (-6.0, -0.7), (-4.0, 4.0))
-"""Bounds of the shared parameters, in the order of BOUNCE_GLOBALS."""
+GLOBAL_RANGE = (
+    *((-20.0, 20.0), (0.0, 10.0), (0.0, 4.0), (0.15, 1.5), (-6.0, -0.7)),
+    *((-0.75, 0.0), (-4.0, 4.0)),
+)
+"""Bounds of the shared parameters, in the order of EVERY_GLOBAL: no lens passes more light at its rim."""
 
 DARKEST = 0.24
 """Share of the light that the brightest tissue (98th percentile) reflects at least. Less is asked for where
@@ -159,5 +162,5 @@ def rescaled(state: State, log_scale: float) -> State:
 
 
 def bounded(shared: Globals, vector: Tensor) -> Globals:
-    limits = torch.tensor(GLOBAL_RANGE, dtype=torch.float64)[: len(vector)]
+    limits = torch.tensor(GLOBAL_RANGE, dtype=torch.float64)[shared.places]
     return replace(shared, vector=torch.clamp(vector, limits[:, 0], limits[:, 1]))

@@ -26,7 +26,7 @@ from endotwin.evidence.coat import LEAST_SIGHTINGS, Highlights
 from endotwin.evidence.tone import Hues
 from endotwin.fit.faint import NOTHING, Faint
 from endotwin.fit.gauss_newton import TEMPER
-from endotwin.fit.model import BOUNCE_GLOBALS, F0, Globals, free_directions, linearise, predict
+from endotwin.fit.model import F0, GLOBALS, Globals, free_directions, linearise, predict
 from endotwin.fit.prior import ROUGHNESS_LOGIT_SPREAD, global_prior
 from endotwin.fit.state import bounded, roughness_slope
 from endotwin.light import shading
@@ -35,7 +35,7 @@ from endotwin.pixels.samples import Samples
 from endotwin.pixels.start import BRIGHT, DARK, DIFFUSE_SIN2, trust
 from endotwin.surface import Surface
 
-LEVEL, SCALE = (BOUNCE_GLOBALS.index(name) for name in ("gamma·ln L0", "ln albedo scale"))
+LEVEL = GLOBALS.index("gamma·ln L0")
 
 DARKEST = 0.03
 """Display value of the prediction below which noise rules the logarithm."""
@@ -153,13 +153,14 @@ class Within:
 
         How diffuse light falls off towards grazing says most of γ, and the lobe that tissue really has is
         nobody's: off the highlights its shape, which Burley's roughness sets, is found beside them and left.
+        Vignetting stays as the probe has found it by the same differences.
 
         Args:
             material: [N, 4] at the samples. held: which of n, q and gamma stay. noise: of a pixel, in display
                 values.
         """
         diffuse = self.samples.sin2 > DIFFUSE_SIN2
-        found = self._step(material, shared, (*held, "level", "f0"), diffuse, noise, varied)
+        found = self._step(material, shared, (*held, "level", "f0", "k2"), diffuse, noise, varied)
         if not shared.specular:
             return found
         shone = self.shone(material, found.shared, noise)
@@ -171,7 +172,7 @@ class Within:
         Without a coat roughness is left to the materials: diffuse light depends on it as well, and it would
         take up what other faults of the model leave.
         """
-        kept = ("level", "n", "q", "gamma", *(("albedo scale",) * shared.bounces))
+        kept = ("level", "n", "q", "gamma", "k2", "albedo scale")
         return self._step(material, shared, kept, torch.ones(len(self.samples), dtype=torch.bool), noise)
 
     def highlights(self, material: Tensor, shared: Globals, noise: float) -> Callable[[Coat], Highlights]:
@@ -207,7 +208,7 @@ class Within:
         by_raw = roughness_slope(material[rows, 3])[:, None]
         passing = [model.by_globals[bright][..., F0], model.by_roughness[bright] * by_raw]
         if shared.bounces:
-            passing.append(model.by_globals[bright][..., SCALE])
+            passing.append(model.by_globals[bright][..., -1])
 
         alike = np.full(len(rows), RATIO_ERROR**2)
 
@@ -254,7 +255,7 @@ class Within:
         found = regress(target, design, varied.frames, rounds=REWEIGHTS)
         along, aside_mm, fainter, shine = np.split(found.coefficients, ends)
         along, (rougher, wetter) = free @ along, shine if coated else (0.0, 0.0)
-        spread = np.r_[global_prior(self.unit_mm, len(shared.vector))[1].numpy(), ROUGHNESS_LOGIT_SPREAD]
+        spread = np.r_[global_prior(self.unit_mm, shared)[1].numpy(), ROUGHNESS_LOGIT_SPREAD]
         length = min(1.0, float((spread / np.maximum(np.abs(np.r_[along, rougher]), 1e-12)).min()))
         if coated:
             weight = max(0.0, shared.coat.weight + length * float(wetter))
@@ -270,7 +271,7 @@ class Within:
         """Columns of the ``free`` directions, of what is ``varied``, first of guides' places, of roughness
         where light is ``diffuse`` or a coat is sought, and then of its weight; and what is known of their
         coefficients."""
-        mean, spread = (x.numpy() for x in global_prior(self.unit_mm, len(shared.vector)))
+        mean, spread = (x.numpy() for x in global_prior(self.unit_mm, shared))
         known = np.zeros(seen.by_varied.shape[1])
         known[: 3 * varied.guides] = TEMPER / (ASIDE_SPREAD * self.samples.distance_mm) ** 2
         sure = TEMPER / spread**2

@@ -71,7 +71,8 @@ class Samples:
         frame: int32 [N], index of the photo. pixel: int32 [N], row-major.
         guides: how guides beside the lens light the pixels; None: the light is at the lens.
         bounce: what other tissue throws on them; None: nothing.
-        log_exposure: float32 [N], ln of gain and vignetting; None: 0.
+        log_exposure: float32 [N], ln of gain; None: 0. radius2: float32 [N], r² of ``Vignetting``; None: the
+            lens does not vignette.
         views: the photos; None for samples that no photo showed.
     """
 
@@ -87,6 +88,7 @@ class Samples:
     guides: Guided | None = None
     bounce: Bounce | None = None
     log_exposure: Tensor | None = None
+    radius2: Tensor | None = None
     views: Views | None = None
 
     def __len__(self) -> int:

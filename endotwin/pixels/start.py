@@ -25,6 +25,9 @@ LIGHT_MEAN = (PRIOR["gamma"] * PRIOR["n"], PRIOR["gamma"] * PRIOR["q"], PRIOR["g
 LIGHT_SPREAD = (0.5, 0.25, 0.1)
 """Prior of γn, γq and γ, in which a diffuse surface's log C is linear: mean and standard deviation."""
 
+VIGNETTING_SPREAD = 0.1
+"""That of γ·k2 about 0."""
+
 BRIGHT, DARK = 250, 5
 """Display values beyond which a photo says little about log radiance."""
 

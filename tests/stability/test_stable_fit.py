@@ -120,18 +120,20 @@ def test_a_parameter_that_the_photos_cannot_tell_is_still_at_its_prior_after_the
 
 
 def test_steps_along_free_directions_leave_what_is_held():
+    from endotwin.effects.vignetting import Vignetting
     from endotwin.fit.model import Globals, free_directions
 
-    shared = Globals.of(Light(30.0, 1.7, 2.2), Response(0.4), 0.04)
-    for held in ((), ("n",), ("q",), ("n", "q"), ("n", "q", "gamma")):
+    shared = Globals.of(Light(30.0, 1.7, 2.2), Response(0.4), 0.04).behind(Vignetting(-0.3))
+    for held in ((), ("n",), ("q",), ("n", "q"), ("n", "q", "gamma"), ("k2",), ("n", "k2")):
         free = free_directions(shared, held)
-        assert free.shape == (5, 5 - len(held))
-        moved = Globals(shared.vector + torch.from_numpy(free @ np.full(free.shape[1], 0.05)))
+        assert free.shape == (6, 6 - len(held))
+        moved = replace(shared, vector=shared.vector + torch.from_numpy(free @ np.full(free.shape[1], 0.05)))
         _, n, q = moved.log_light
         kept = {
             "n": n == pytest.approx(1.7),
             "q": q == pytest.approx(2.2),
             "gamma": moved.gamma == pytest.approx(0.4),
+            "k2": moved.k2 == pytest.approx(-0.3),
         }
         assert all(kept[name] == (name in held) for name in kept if held or not kept[name])
 
