@@ -4,6 +4,7 @@ import json
 import logging
 import shutil
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 
 import cv2
@@ -20,7 +21,7 @@ from endotwin.fit import fit
 from endotwin.fit.solve import median_edge_mm
 from endotwin.fit.steps import proxies
 from endotwin.pixels.pace import Pace
-from endotwin.pixels.samples import gather
+from endotwin.pixels.samples import BLACK, frame_samples, gather
 from endotwin.surface.casting import Caster
 
 pytestmark = pytest.mark.slow
@@ -166,6 +167,21 @@ def test_samples_carry_the_color_that_their_surface_point_has_under_their_incide
     error = np.abs(samples.color.numpy() / 255 - np.clip(radiance, 0, 1) ** tube_sequence.GAMMA)
     assert np.median(error) < 1 / 255
     assert np.percentile(error, 95) < 4 / 255
+
+
+def test_pixels_through_which_the_edge_of_a_shadow_may_run_are_no_samples(tube):
+    """They show part of the light; what lies in the shadow, and one pixel farther off, stays."""
+    sequence = tube.sequence()
+    frame, every = sequence.frame(0), np.ones((72, 96), bool)
+    color = frame.color.copy()
+    color[55:65, 10:20] = np.random.default_rng(0).integers(0, BLACK + 1, (10, 10, 3))
+    parts = [
+        frame_samples(tube, Caster(tube.surface), photo, every, 1.0, np.random.default_rng(0))
+        for photo in (frame, replace(frame, color=color))
+    ]
+    lit, shadowed = ({divmod(pixel, 96) for pixel in part.pixel.tolist()} for part in parts)
+    edge = set(product(range(54, 66), range(9, 21))) - set(product(range(55, 65), range(10, 20)))
+    assert lit - shadowed == edge & lit and len(edge & lit) > 40
 
 
 @pytest.mark.parametrize("budget_s", (1e-3, 0.3))

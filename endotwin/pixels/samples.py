@@ -6,6 +6,7 @@ import logging
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 import torch
 from torch import Tensor
@@ -253,7 +254,7 @@ def frame_samples(
     share: float,
     generator: np.random.Generator,
 ) -> Samples:
-    chosen = lens_mask & np.isfinite(frame.depth_mm)
+    chosen = lens_mask & np.isfinite(frame.depth_mm) & ~beside_black(frame.color)
     if twin.registration is None or twin.registration.with_depth:
         chosen &= ~discontinuities(frame.depth_mm)
         if share < 1:
@@ -272,6 +273,13 @@ def frame_samples(
         pixel=torch.from_numpy(hits.pixel.astype(np.int32)),
         **{name: torch.from_numpy(value) for name, value in vars(geometry).items()},
     )
+
+
+def beside_black(color: np.ndarray) -> np.ndarray:
+    """Bool [H, W]: pixels of a photo [H, W, 3] that show light, beside one that shows none: the edge of a
+    shadow, or of the lens's picture, may run through them, so that they show part of what is there."""
+    black = (color.max(axis=2) <= BLACK).astype(np.uint8)
+    return cv2.dilate(black, np.ones((3, 3))) > black
 
 
 def _at_depth(hits: Correspondences, depth_mm: np.ndarray, twin: Twin) -> np.ndarray:
