@@ -105,3 +105,22 @@ def test_every_package_is_installed():
     listed = re.search(r"packages = \[(.*?)\]", (ROOT / "pyproject.toml").read_text("utf-8"), re.S)[1]
     packages = {name for name, path in MODULES.items() if path.name == "__init__.py"}
     assert set(re.findall(r'"(.+?)"', listed)) == {*packages, "endotwin.configs"}
+
+
+def loaded_with(path: Path) -> set[str]:
+    """What the file imports as it is loaded, and the packages that lie around it."""
+    found = set()
+    for node in ast.parse(path.read_text("utf-8")).body:
+        if isinstance(node, ast.Import):
+            found |= {name.name for name in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            found |= {node.module, *(f"{node.module}.{name.name}" for name in node.names)}
+    return {".".join(name.split(".")[:depth]) for name in found for depth in range(1, name.count(".") + 2)}
+
+
+def test_what_takes_a_second_to_load_is_loaded_only_with_what_cannot_do_without():
+    loads, slow, known = {name: loaded_with(path) for name, path in MODULES.items()}, set(), None
+    while slow != known:
+        known = slow
+        slow = {name for name, others in loads.items() if others & {"open3d", "trimesh", *known}}
+    assert {room(name) for name in slow} == {"fusion", "export", "selfcheck"}

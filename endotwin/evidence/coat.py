@@ -10,7 +10,7 @@ from functools import cached_property
 from operator import attrgetter
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from endotwin.effects import Decision
 from endotwin.effects.coat import Coat
@@ -30,7 +30,7 @@ SEARCH_ROUNDS = 2
 LONGEST_LOG = 1.5
 """The farthest that ln of a weight may rise in the step after the first."""
 
-WORTH = chi2.isf(0.01 / (len(ROUGHNESSES) * len(TAILS)), df=1) / 2
+WORTH = chdtri(1, 0.01 / (len(ROUGHNESSES) * len(TAILS))) / 2
 """Log likelihood by which the best of as many lobes beats none in one of a hundred bare tissues."""
 
 

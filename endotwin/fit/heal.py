@@ -10,9 +10,9 @@ import torch
 from scipy.sparse.linalg import spsolve
 
 from endotwin.fit.state import State
-from endotwin.fusion.smooth import neighbour_mean
 from endotwin.pixels.samples import Samples
 from endotwin.surface import Surface
+from endotwin.surface.neighbours import neighbour_mean
 from endotwin.surface.silhouettes import dilated
 
 REACH_PX = 3

@@ -12,11 +12,11 @@ from scipy.sparse.linalg import spsolve
 from endotwin.cameras import Camera
 from endotwin.fusion.agreement import Tolerance, against
 from endotwin.fusion.mesh import boundary_edges, surface_of
-from endotwin.fusion.smooth import neighbour_mean
 from endotwin.fusion.views import View
 from endotwin.run.ahead import ahead
 from endotwin.run.threads import THREADS
 from endotwin.surface import Surface
+from endotwin.surface.neighbours import neighbour_mean
 
 LONGEST_RIM_VOXELS = 30.0
 """A hole with a longer rim stays open: about 10 voxels across, it is no gap in the sampling."""

@@ -5,11 +5,10 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import scipy.sparse
-import trimesh
 
 from endotwin.fusion.mesh import surface_of
 from endotwin.surface import Surface
+from endotwin.surface.neighbours import neighbour_mean
 from endotwin.surface.vectors import unit
 
 CRUMPLED_DEG = 1.5
@@ -31,6 +30,8 @@ def smoothed(surface: Surface) -> Surface:
     """
     if crumple_deg(surface) <= CRUMPLED_DEG:
         return surface
+    import trimesh  # which takes most of a second, and clean depth does without
+
     mesh = trimesh.Trimesh(surface.vertices_mm, surface.triangles, process=False)
     neighbours = neighbour_mean(len(surface.vertices_mm), surface.triangles)
     filled = surface.filled
@@ -61,12 +62,3 @@ def _neighbours_normals(surface: Surface) -> np.ndarray:
     they cancel."""
     mean = (neighbour_mean(len(surface.vertices_mm), surface.triangles) @ surface.normals).astype(np.float32)
     return np.where(mean.any(axis=1, keepdims=True), unit(mean), surface.normals)
-
-
-def neighbour_mean(count: int, triangles: np.ndarray) -> scipy.sparse.csr_array:
-    """Operator [V, V] that replaces each vertex's value by the mean over its neighbours in ``triangles``."""
-    start, end = triangles[:, [0, 1, 1, 2, 2, 0]].ravel(), triangles[:, [1, 0, 2, 1, 0, 2]].ravel()
-    joined = scipy.sparse.csr_array((np.ones(len(start), np.float32), (start, end)), shape=(count, count))
-    joined.data[:] = 1
-    degree = np.maximum(joined.sum(axis=1), 1)
-    return scipy.sparse.csr_array(scipy.sparse.diags_array(1 / degree) @ joined)

@@ -8,7 +8,6 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-import trimesh
 
 from endotwin.cameras import camera_from_dict
 from endotwin.errors import EndotwinError, SequenceError
@@ -105,6 +104,8 @@ class Written:
     @cached_property
     def surface(self) -> tuple[np.ndarray, np.ndarray]:
         """Vertices float64 [V, 3], world, mm, and triangles [F, 3] of ``surface.ply``."""
+        import trimesh
+
         mesh = trimesh.load(self.folder / "surface.ply", process=False)
         return np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces)
 

@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import trimesh
 
 from endotwin.cameras import Camera
 from endotwin.effects.video import CLIP_FRAMES, Video
@@ -214,6 +213,8 @@ def _finish(job: Job, partial: Partial) -> None:
         for index in range(len(job)):
             file.write(json.dumps(frame_record(job, index)) + "\n")
     if {"triangles", "vertices"} & set(job.labels):
+        import trimesh  # which takes most of a second, and few datasets call for
+
         surface = job.twin.surface
         points = surface.vertices_mm.astype("float64") + surface.origin_mm
         trimesh.Trimesh(points, surface.triangles, process=False).export(folder / "surface.ply")

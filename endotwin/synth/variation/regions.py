@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import trimesh
 from scipy.spatial import cKDTree
 
 from endotwin.errors import OptionError
@@ -70,6 +69,8 @@ def _painted(file: Path, surface: Surface) -> np.ndarray:
             if weight.shape != (count,) or not np.isfinite(weight.astype(np.float64)).all():
                 raise ValueError(f"its shape is {weight.shape}, the surface has {count} vertices")
             return np.clip(weight, 0, 1)
+        import trimesh
+
         mesh = trimesh.load(file, process=False, force="mesh")
         colors = np.asarray(mesh.visual.vertex_colors)[:, :3].mean(axis=1) / 255
         nearest = cKDTree(mesh.vertices).query(surface.vertices_mm + surface.origin_mm)[1]
