@@ -5,12 +5,14 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import cache
 from typing import TYPE_CHECKING
 
 from endotwin.errors import OptionError
 
 if TYPE_CHECKING:
     import torch
+    from threadpoolctl import ThreadpoolController
 
 DEVICES = ("cpu", "cuda", "auto")
 
@@ -46,17 +48,25 @@ def device_of(name: str) -> torch.device:
     return torch.device("cuda" if there and name != "cpu" else "cpu")
 
 
+@cache
+def _blas() -> ThreadpoolController:
+    """The BLAS of NumPy and that of SciPy, looked for once: that takes as long as some of the work."""
+    import scipy.linalg  # noqa: F401, which loads its own
+    from threadpoolctl import ThreadpoolController
+
+    return ThreadpoolController().select(user_api="blas")
+
+
 @contextmanager
 def one_core() -> Iterator[None]:
     """Torch and BLAS keep to the calling thread, and to each that is started in the block: small work takes
     four times as long where they have threads of their own."""
     import torch
-    from threadpoolctl import threadpool_limits
 
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
-        with threadpool_limits(1, user_api="blas"):
+        with _blas().limit(limits=1):
             yield
     finally:
         torch.set_num_threads(before)
