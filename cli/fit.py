@@ -58,7 +58,7 @@ def fit(
         typer.Option(
             metavar="auto|on|off",
             help="Align the photos to the surface first, as 'endotwin align' does.",
-            show_default="as decided before, else auto; off under a budget",
+            show_default="as decided before, else auto; off under a budget and for endopbr",
         ),
     ] = None,
     seed: Annotated[int, typer.Option(metavar="N", min=0, help="Seed of all random choices.")] = 0,

@@ -22,12 +22,18 @@ def main() -> None:
     parser.add_argument("--scale", type=float, default=0.5, help="factor on C3VD's 1350×1080 pixels")
     parser.add_argument("--frames", type=int, default=200, help="frames to render")
     parser.add_argument("--budget", type=float, help="seconds for the fit")
+    parser.add_argument("--twin", type=Path, help="folder to keep the twin in, to inspect or export it")
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
+    for folder in (options.dataset, options.twin):
+        if folder is not None and folder.exists():
+            parser.error(f"{folder} is there already; name another folder")
 
     twin = endotwin.fuse_twin(options.sequence, scale=options.scale)
     twin = endotwin.fit_twin(twin, budget_s=options.budget, seed=options.seed)
     print(endotwin.evaluate(twin))
+    if options.twin is not None:
+        twin.save(options.twin)
     summary = endotwin.synthesize(
         twin,
         f"jitter:frames={options.frames},translation=2,rotation=10",
@@ -35,6 +41,7 @@ def main() -> None:
         material=["roughness*1.3"],
         light=["intensity*0.8"],
         seed=options.seed,
+        workers=0,
     )
     print(summary)
 
