@@ -32,7 +32,7 @@ from endotwin.evidence.guide_search import Ground, Guides, Search, found_guides,
 from endotwin.evidence.log_light import Bounced
 from endotwin.evidence.probe import Fitted, Hypothesis, Probe
 from endotwin.evidence.verdict import MIN_GAIN_DB, MIN_IMPOSSIBLE_DB, MIN_SIGMAS, Verdict
-from endotwin.evidence.worth import BARE, LEAST, more_usual, worth
+from endotwin.evidence.worth import BARE, LEAST, UNSHADED_DB, more_usual, worth
 from endotwin.light.guides import AT_LENS, COSINE, EXPONENTIAL
 from endotwin.pixels.samples import Samples
 from endotwin.pixels.start import PRIOR
@@ -294,7 +294,18 @@ class _Trial:
 
     def _worth_within(self, names: frozenset[str], name: str, verdict: Verdict) -> bool:
         model = self._model(names)
-        return worth(name, verdict, model) or (name == "offset" and self._ground.certain(model, verdict))
+        if name != "offset":
+            return worth(name, verdict, model)
+        found = worth(name, verdict, model) and self._borne_out(model, verdict)
+        return found or self._ground.certain(model, verdict)
+
+    def _borne_out(self, model: Fitted, verdict: Verdict) -> bool:
+        """Whether guides of ``model`` gain more, by their ``verdict``, than a bounce errs by, or cast shadows
+        that show."""
+        if model.hypothesis.bounced is None or verdict.gain_db >= UNSHADED_DB:
+            return True
+        unshadowed = self._probe.fit(replace(model.hypothesis, shadows=False))
+        return self._probe.compare(unshadowed, model).sigmas >= MIN_SIGMAS
 
     def _verdict(self, without: frozenset[str], names: frozenset[str]) -> Verdict:
         return self._probe.compare(self._model(without), self._model(names))

@@ -261,6 +261,23 @@ def test_shadows_are_cast_by_guides_unless_hardly_a_pixel_lies_in_one_or_many_co
     assert state(samples, np.multiply(GUIDES_MM, 3)) == "off"
 
 
+@needs_data
+def test_guides_that_gain_little_beside_a_bounce_are_borne_out_by_shadows_that_show(lit_from_beside):
+    twin, caster, samples, glints = lit_from_beside
+    trial = _Trial(Probe(samples, twin, caster), glints, {}, lambda: False, AT_LENS)
+
+    def borne_out(guides_mm, gain_db: float, bounces: bool = True) -> bool:
+        guides_mm = tuple(map(tuple, guides_mm))
+        bounced = trial._bouncing(guides_mm) if bounces else None
+        model = trial._probe.fit(Hypothesis(guides_mm, shadows=True, bounced=bounced))
+        return trial._borne_out(model, Verdict(gain_db, 5.0))
+
+    nearly_at_lens = np.multiply(GUIDES_MM, [0.01, 0.01, 1])
+    assert borne_out(GUIDES_MM, 0.3)
+    assert not borne_out(nearly_at_lens, 0.3)
+    assert borne_out(nearly_at_lens, 0.3, bounces=False) and borne_out(nearly_at_lens, 0.6)
+
+
 @pytest.mark.parametrize(
     ("gain_db", "likelier", "state"),
     [(-0.05, 2.7, "on"), (-0.05, 1.0, "off"), (-0.5, 2.7, "off"), (0.15, -1.0, "on")],
