@@ -89,7 +89,11 @@ def guides_aside(samples: Samples, surface: Surface, effects: Effects, step_mm: 
 
 
 class Relighting:
-    """What of the light depends on the materials, renewed as the fit finds them."""
+    """What of the light depends on the materials, renewed as the fit finds them.
+
+    Of vignetting its ``effects`` say that there is some, and where the fit starts: what it has found is among
+    the parameters that all pixels share.
+    """
 
     def __init__(
         self, surface: Surface, caster: Caster, effects: Effects, views: Views, faint: Faint = NOTHING
@@ -146,13 +150,12 @@ class Relighting:
             solver.relight(self.exposed(solver.samples))
 
     def expose(self, solver: GaussNewton, effects: Effects) -> None:
-        """The samples of ``solver`` with the gain and vignetting of ``effects``, which hold from here on, and
-        nothing faint."""
+        """The samples of ``solver`` exposed with ``effects``, which hold from here on, and nothing faint."""
         self.effects, self.faint = effects, NOTHING
         solver.relight(self.exposed(solver.samples))
 
     def exposed(self, samples: Samples) -> Samples:
-        """``samples`` with the effects' gain and vignetting, and what is faint."""
+        """``samples`` as ``exposed`` with the effects, and with what is faint."""
         samples = exposed(samples, self.effects)
         if not self.faint.found:
             return samples

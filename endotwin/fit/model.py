@@ -36,8 +36,8 @@ class Globals:
     for.
 
     Without ``specular`` there is no specular lobe, and ln f0 stays where it is. A ``coat`` adds a lobe of its
-    own; a ``tone`` bends what x^γ displays. ``tissue`` [3] is the mean of ln of the base colours that bounced
-    light follows; None: what it was when that was found.
+    own; a ``tone`` bends what x^γ displays; a lens that ``vignettes`` adds a parameter. ``tissue`` [3] is the
+    mean of ln of the base colours that bounced light follows; None: what it was when that was found.
     """
 
     vector: Tensor
