@@ -186,8 +186,11 @@ def test_derivative_by_material_is_the_central_difference(channel, scene):
 
 @pytest.mark.parametrize(
     "scene, index",
-    [(scene, index) for scene in SCENES for index in range(len(shared_of(scene).vector))],
-    ids=str,
+    [
+        pytest.param(scene, index, id=f"{scene}-{EVERY_GLOBAL[place]}")
+        for scene in SCENES
+        for index, place in enumerate(shared_of(scene).places)
+    ],
 )
 def test_derivative_by_a_shared_parameter_is_the_central_difference_at_the_displayed_color(scene, index):
     """What is fitted is b^γ: as γ moves, b moves with it."""

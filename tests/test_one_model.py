@@ -29,7 +29,7 @@ GUIDES = Offset(((3.2, 0.5, 0.0), (-2.8, 2.7, 0.0)))
 SCENES = {
     "light": [],
     "gain": [Gain((0, 1), (-0.2, 0.2))],
-    "vignetting": [Vignetting(-0.5)],
+    "vignetting": [Vignetting(-0.5, -0.1)],
     "profile": [Profile(0.7)],
     "offset and shadows": [GUIDES, Shadows()],
     "interreflection": [Interreflection(4.0)],
@@ -40,7 +40,7 @@ SCENES = {
         Shadows(),
         Interreflection(4.0),
         Gain((0, 1), (-0.2, 0.2)),
-        Vignetting(-0.5),
+        Vignetting(-0.5, -0.1),
         Profile(0.7),
         Coat(0.8, 0.15),
         Tone(0.3),

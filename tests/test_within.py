@@ -9,6 +9,7 @@ import torch
 from endotwin.effects import Decision
 from endotwin.effects.coat import Coat
 from endotwin.effects.tone import Tone
+from endotwin.effects.vignetting import Vignetting
 from endotwin.evidence.coat import judged
 from endotwin.evidence.tone import judged as judged_tone
 from endotwin.evidence.tone import steadied
@@ -80,6 +81,14 @@ def test_light_response_and_f0_are_found_beside_an_albedo_that_is_nowhere_right(
     for _ in range(4):
         shared = within.renewed(material, shared, (), NOISE).shared
     assert told(shared) == pytest.approx(told(TRUE), rel=0.01)
+
+
+def test_what_a_lens_dims_stays_as_the_probe_has_found_it():
+    within, material = photographed()
+    radius2 = torch.from_numpy(np.random.default_rng(7).uniform(0, 1.4, len(material)))
+    behind = replace(within, samples=replace(within.samples, radius2=radius2))
+    found = behind.renewed(material, TRUE.behind(Vignetting(-0.1)), (), NOISE).shared
+    assert found.k2 == pytest.approx(-0.1) and told(found) != told(TRUE)
 
 
 @pytest.mark.parametrize("tail", [1.0, 2.0])

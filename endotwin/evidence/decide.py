@@ -171,8 +171,7 @@ class _Trial:
             reason = "light at the lens casts no shadow that the lens sees"
             self._decisions["shadows"] = Decision("off", reason)
             return kept
-        unshadowed = self._probe.fit(replace(kept.hypothesis, shadows=False))
-        verdict = self._probe.told_by_shadows(kept, unshadowed)
+        unshadowed, verdict = self._without_shadows(kept)
         cast = self._probe.shaded_db(kept) >= MIN_GAIN_DB and verdict.sigmas > -MIN_SIGMAS
         on = self.wanted("shadows") == "on" or (self.wanted("shadows") == "auto" and cast)
         self._say("shadows", on, verdict)
@@ -304,8 +303,12 @@ class _Trial:
         that show."""
         if model.hypothesis.bounced is None or verdict.gain_db >= UNSHADED_DB:
             return True
+        return self._without_shadows(model)[1].sigmas >= MIN_SIGMAS
+
+    def _without_shadows(self, model: Fitted) -> tuple[Fitted, Verdict]:
+        """``model`` with guides that cast no shadows, and what shadows say of those of the ``model``."""
         unshadowed = self._probe.fit(replace(model.hypothesis, shadows=False))
-        return self._probe.compare(unshadowed, model).sigmas >= MIN_SIGMAS
+        return unshadowed, self._probe.told_by_shadows(model, unshadowed)
 
     def _verdict(self, without: frozenset[str], names: frozenset[str]) -> Verdict:
         return self._probe.compare(self._model(without), self._model(names))

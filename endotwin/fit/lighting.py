@@ -43,16 +43,17 @@ def lit(samples: Samples, surface: Surface, caster: Caster, effects: Effects) ->
 
 
 def exposed(samples: Samples, effects: Effects) -> Samples:
-    """``samples`` with the gain of ``effects``, if there is any, and where in the lens's picture they lie, if
-    it vignettes."""
-    gain = radius2 = None
+    """``samples`` with the gain of ``effects``, if there is any, and, if the lens vignettes, with where they
+    lie in its picture, and what stays of that while k2 is found."""
+    parts, radius2, lens = [], None, effects.get("vignetting")
     if "gain" in effects:
-        gain = torch.from_numpy(np.log(effects["gain"].of(samples.frame.numpy())))
-    if "vignetting" in effects:
+        parts.append(torch.from_numpy(np.log(effects["gain"].of(samples.frame.numpy()))))
+    if lens is not None:
         radius2 = samples.radius2
         if radius2 is None:
             radius2 = torch.from_numpy(squared_radius(samples.views.camera, samples.pixel.numpy()))
-    return replace(samples, log_exposure=gain, radius2=radius2)
+        parts += [lens.k4 * radius2**2] * bool(lens.k4)
+    return replace(samples, log_exposure=sum(parts) if parts else None, radius2=radius2)
 
 
 def _guided(samples: Samples, surface: Surface, caster: Caster, effects: Effects) -> Guided:

@@ -56,9 +56,9 @@ class Globals:
         return cls(torch.tensor(values + [0.0] * bounce, dtype=torch.float64), specular)
 
     def behind(self, lens: Vignetting | None) -> Globals:
-        """The same behind a ``lens`` that vignettes by its k2; None: that does not vignette."""
+        """The same behind a ``lens`` that vignettes, whose k2 is found; None: that does not vignette."""
         rest = [torch.tensor([self.gamma * lens.k2], dtype=torch.float64)] if lens else []
-        bare, scale = self.vector[: len(GLOBALS)], self.vector[len(GLOBALS) + self.vignettes :]
+        bare, scale = self.vector[: len(GLOBALS)], self.vector[self.unscaled :]
         return replace(self, vector=torch.cat([bare, *rest, scale]), vignettes=lens is not None)
 
     @property
@@ -85,12 +85,17 @@ class Globals:
 
     def without_scale(self) -> Globals:
         """The same without interreflection."""
-        return replace(self, vector=self.vector[: len(GLOBALS) + self.vignettes])
+        return replace(self, vector=self.vector[: self.unscaled])
+
+    @property
+    def unscaled(self) -> int:
+        """How many parameters come before the albedo's scale."""
+        return len(GLOBALS) + self.vignettes
 
     @property
     def bounces(self) -> bool:
         """Whether light bounces between tissue."""
-        return len(self.vector) > len(GLOBALS) + self.vignettes
+        return len(self.vector) > self.unscaled
 
     @property
     def k2(self) -> float:
@@ -116,9 +121,8 @@ class Globals:
 
 def columns_of(shared: Globals, bordered: bool) -> np.ndarray:
     """What the columns of ``Linearised.by_shared`` are of the shared parameters, [columns, G]."""
-    alone = len(shared.vector) - shared.bounces
-    plain, scale = np.split(np.eye(len(shared.vector)), [alone])
-    return np.concatenate([plain[: alone * bordered], *[scale] * 3])
+    plain, scale = np.split(np.eye(len(shared.vector)), [shared.unscaled])
+    return np.concatenate([plain[: shared.unscaled * bordered], *[scale] * 3])
 
 
 def free_directions(shared: Globals, held: tuple[str, ...]) -> np.ndarray:
@@ -223,8 +227,8 @@ class Linearised:
     def by_shared(self, shared: Globals, bordered: bool) -> Tensor:
         """dC by the ``shared`` parameters, if the equations are ``bordered`` by them, with the albedo's scale
         apart for each channel: [N, 3, columns]."""
-        alone = len(shared.vector) - shared.bounces
-        plain, scale = self.by_globals[..., : alone * bordered], self.by_globals[..., alone:]
+        count = shared.unscaled
+        plain, scale = self.by_globals[..., : count * bordered], self.by_globals[..., count:]
         return torch.cat([plain, torch.diag_embed(scale[..., 0])], dim=2) if scale.shape[2] else plain
 
     def toned(self, tone: Tone | None) -> Linearised:

@@ -17,7 +17,6 @@ import torch
 from torch import Tensor
 
 from endotwin.effects import Decision, Effect, Effects
-from endotwin.effects.vignetting import Vignetting
 from endotwin.errors import SequenceError
 from endotwin.evidence.decide import Decided, decide
 from endotwin.evidence.glints import Glints
@@ -401,7 +400,7 @@ def _fitted(
         scale = math.exp(state.shared.log_scale)
     light, coat, tone = state.shared.light, state.shared.coat, state.shared.tone
     if state.shared.vignettes:
-        effects = effects.including(Vignetting(k2=state.shared.k2))
+        effects = effects.including(replace(effects["vignetting"], k2=state.shared.k2))
     if coat is not None:
         effects = effects.including(replace(coat, weight=coat.weight * scale))
     if tone is not None:

@@ -25,7 +25,7 @@ from endotwin.sequence import Frame
 from endotwin.surface import Surface
 from endotwin.surface.casting import Caster, Correspondences
 from endotwin.surface.rows import chosen
-from endotwin.surface.silhouettes import discontinuities
+from endotwin.surface.silhouettes import dilated, discontinuities
 from endotwin.surface.vectors import unit
 from endotwin.twin import Twin
 
@@ -72,8 +72,8 @@ class Samples:
         frame: int32 [N], index of the photo. pixel: int32 [N], row-major.
         guides: how guides beside the lens light the pixels; None: the light is at the lens.
         bounce: what other tissue throws on them; None: nothing.
-        log_exposure: float32 [N], ln of gain; None: 0. radius2: float32 [N], r² of ``Vignetting``; None: the
-            lens does not vignette.
+        log_exposure: float32 [N], ln of gain, and of vignetting but for its k2; None: 0.
+        radius2: float32 [N], r² of ``Vignetting``; None: the lens does not vignette.
         views: the photos; None for samples that no photo showed.
     """
 
@@ -278,8 +278,8 @@ def frame_samples(
 def beside_black(color: np.ndarray) -> np.ndarray:
     """Bool [H, W]: pixels of a photo [H, W, 3] that show light, beside one that shows none: the edge of a
     shadow, or of the lens's picture, may run through them, so that they show part of what is there."""
-    black = (color.max(axis=2) <= BLACK).astype(np.uint8)
-    return cv2.dilate(black, np.ones((3, 3))) > black
+    black = cv2.inRange(color, (0,) * 3, (BLACK,) * 3) > 0
+    return dilated(black, 1) & ~black
 
 
 def _at_depth(hits: Correspondences, depth_mm: np.ndarray, twin: Twin) -> np.ndarray:
