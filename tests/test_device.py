@@ -14,8 +14,9 @@ from endotwin.errors import OptionError
 from endotwin.fit import endopbr, normal_equations
 from endotwin.fit.gauss_newton import GaussNewton
 from endotwin.fit.hashgrid import HashGrid, corner_slots, level_slots
+from endotwin.fit.mesh_pattern import pairs_of
 from endotwin.fit.model import linearise, predict
-from endotwin.fit.normal_equations import add, each_product, pairs_of, summed_products
+from endotwin.fit.normal_equations import add, each_product, summed_products
 from endotwin.run import threads
 
 NOWHERE = torch.device("meta")

@@ -9,8 +9,9 @@ import torch
 from endotwin.effects.coat import Coat
 from endotwin.effects.vignetting import Vignetting
 from endotwin.fit.linear import conjugate_gradients, joint_minimum
+from endotwin.fit.mesh_pattern import MeshPattern
 from endotwin.fit.model import EVERY_GLOBAL, Globals, at_pixels, linearise, predict
-from endotwin.fit.normal_equations import MeshPattern, Residual, assemble, robust_cost
+from endotwin.fit.normal_equations import Residual, assemble, robust_cost
 from endotwin.light.bounced import Bounce
 from endotwin.light.guides import Guided
 from endotwin.pixels.samples import Samples, discontinuities
@@ -261,7 +262,7 @@ def test_the_weights_are_those_whose_weighted_error_is_the_slope_of_the_robust_c
 
 @pytest.fixture(scope="module")
 def dense(triangles):
-    """Samples, materials, J [3N, 64] by vertex and channel, dC/dGLOBALS [3N, 5], weight and error [3N, 1]."""
+    """Samples, materials, J [3N, 4·V] by told vertex and channel, dC/dGLOBALS [3N, 5], weight, error [3N]."""
     samples, materials = made_samples(400, len(triangles) - 1), made_materials(16)
     model = linearise(samples, at_pixels(samples, torch.from_numpy(triangles), materials), SHARED)
     residual = Residual.of(samples, model.predicted, WIDTH)
@@ -272,7 +273,7 @@ def dense(triangles):
                 J[sample, c, vertex, c] += weight * model.by_color[sample, c]
                 J[sample, c, vertex, 3] += weight * model.by_roughness[sample, c]
     flat = [x.numpy().reshape(1200, -1) for x in (model.by_globals, residual.weight, residual.error)]
-    return samples, materials, J.reshape(1200, 64), *flat
+    return samples, materials, J[:, :, np.unique(triangles[:-1])].reshape(1200, -1), *flat
 
 
 @pytest.fixture(scope="module")
@@ -288,15 +289,15 @@ def close(got, expected) -> None:
 
 def test_products_with_the_normal_equations_are_those_of_the_dense_matrix(equations, dense):
     _, _, J, _, weight, _ = dense
-    values = np.random.default_rng(4).normal(size=(16, 4, 3))
+    values = np.random.default_rng(4).normal(size=(J.shape[1] // 4, 4, 3))
     got = equations @ torch.from_numpy(values).float()
-    close(got.numpy().reshape(64, 3), J.T @ (weight * (J @ values.reshape(64, 3))))
+    close(got.numpy().reshape(-1, 3), J.T @ (weight * (J @ values.reshape(-1, 3))))
 
 
 def test_right_hand_sides_and_shared_blocks_are_the_dense_ones(equations, dense):
     _, _, J, by_globals, weight, error = dense
     against = np.concatenate([error, by_globals], axis=1)
-    close(equations.right.numpy().reshape(64, 6), J.T @ (weight * against))
+    close(equations.right.numpy().reshape(-1, 6), J.T @ (weight * against))
     close(equations.shared, by_globals.T @ (weight * by_globals))
     close(equations.shared_right, (by_globals.T @ (weight * error))[:, 0])
 
@@ -307,7 +308,7 @@ def test_assembling_in_chunks_changes_nothing(equations, dense, triangles, monke
     pattern = MeshPattern(samples, triangles, 16)
     again = assemble(samples, pattern, torch.from_numpy(triangles), dense[1].float(), SHARED, WIDTH)
     close(again.right.numpy(), equations.right.numpy())
-    close(again.roughness.to_dense().numpy(), equations.roughness.to_dense().numpy())
+    close(again.matrix.to_dense().numpy(), equations.matrix.to_dense().numpy())
 
 
 @pytest.mark.parametrize("sin2", [DIFFUSE_SIN2 - 0.01, DIFFUSE_SIN2 + 0.01])
@@ -320,14 +321,24 @@ def test_beside_bounced_light_only_highlights_tell_roughness(dense, triangles, s
     equations = assemble(
         samples, pattern, torch.from_numpy(triangles), dense[1].float(), BOUNCE_SHARED, WIDTH
     )
-    told = bool(equations.roughness.to_dense().any()), bool(equations.right[:, 3].any())
+    by_channel = equations.matrix.to_dense().unflatten(0, (-1, 4)).unflatten(2, (-1, 4))
+    told = bool(by_channel[:, 3].any()), bool(equations.right[:, 3].any())
     assert told == (sin2 < DIFFUSE_SIN2,) * 2
-    assert equations.color[0].to_dense().any()
+    assert by_channel[:, 0].any()
+
+
+def test_only_vertices_that_samples_tell_of_have_rows(triangles, dense):
+    pattern = MeshPattern(dense[0], triangles, 20)
+    assert pattern.told.numpy().nonzero()[0].tolist() == pattern.vertices.tolist()
+    assert pattern.vertices.tolist() == np.unique(triangles[dense[0].triangle]).tolist() != list(range(20))
+    np.testing.assert_array_equal(
+        pattern.vertices[pattern.corners[pattern.compact]], triangles[dense[0].triangle]
+    )
 
 
 def test_lumped_blocks_are_the_row_sums_of_each_pair_of_channels(equations, dense):
     _, _, J, _, weight, _ = dense
-    normal = (J.T @ (weight * J)).reshape(16, 4, 16, 4)
+    normal = (J.T @ (weight * J)).reshape(J.shape[1] // 4, 4, -1, 4)
     close(equations.lumped().numpy(), normal.sum(axis=2))
 
 

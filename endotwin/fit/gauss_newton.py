@@ -24,8 +24,9 @@ from endotwin.fit.following import Following
 from endotwin.fit.frame_gains import FramePattern
 from endotwin.fit.hashgrid import HashOperator
 from endotwin.fit.linear import conjugate_gradients, joint_minimum, squared
+from endotwin.fit.mesh_pattern import MeshPattern
 from endotwin.fit.model import F0, GAMMA, at_pixels, columns_of, free_directions, predict
-from endotwin.fit.normal_equations import CHANNELS, MeshPattern, NormalEquations, assemble, robust_cost
+from endotwin.fit.normal_equations import CHANNELS, NormalEquations, assemble, robust_cost
 from endotwin.fit.prior import global_prior, prior_precision
 from endotwin.fit.state import State, at_furnace, bounded, without_furnace
 from endotwin.light.bounced import WITH_ALL
@@ -109,7 +110,8 @@ class GaussNewton:
         vertex_count = operator.forward_csr.shape[0]
         self.triangles = torch.from_numpy(triangles.astype(np.int64))
         self.pattern = MeshPattern(samples, triangles, vertex_count)
-        self._operator = operator.to(device)
+        self._operator, self._told = operator.to(device), torch.from_numpy(self.pattern.vertices).to(device)
+        self._at_told = operator.of_points(self.pattern.vertices).to(device)
         self._triangles = self.triangles.to(device)
         self.precision = prior_precision(operator, unit_mm).to(device)
         self._unit_mm = unit_mm
@@ -121,7 +123,7 @@ class GaussNewton:
         chosen = drawn(len(samples), SEARCH_SAMPLES, np.random.default_rng(seed))
         self.trial_rows = torch.from_numpy(chosen) if len(chosen) < len(samples) else slice(None)
         self.relight(samples)
-        self.squared_adjoint = squared(self._operator.adjoint_csr)
+        self.squared_adjoint = squared(self._at_told.adjoint_csr)
 
     def relight(self, samples: Samples) -> None:
         """Go on with the same samples under other light or exposure."""
@@ -211,7 +213,9 @@ class GaussNewton:
             columns = columns_of(state.shared, joint) @ shared_step.numpy()
             if len(rise):
                 columns[-3:] += WITH_ALL * (rise - columns[-3:])
-            gain_step = equations.gains.step(state.link_slope * self._operator(table_step), columns)
+            gain_step = equations.gains.step(
+                state.link_slope[self._told] * self._at_told(table_step), columns
+            )
             trusted = min(trusted, MOST_GAIN_STEP / max(float(np.abs(gain_step).max()), 1e-12))
         before = self._cost(state, noise)
         for length in (min(1.0, trusted) * each for each in LENGTHS):
@@ -264,7 +268,7 @@ class GaussNewton:
         """What a step adds to ln of the mean albedo of each channel, [3]; [0] where light follows none."""
         if not self._follows:
             return np.zeros(0)
-        raw_step = self._operator(table_step)[:, :3]
+        raw_step = self._at_told(table_step)[:, :3]
         whiter = (self._whiteness(state) * raw_step).sum(dim=0).cpu().numpy()
         return whiter + float(shared_step[-1])
 
@@ -282,7 +286,7 @@ class GaussNewton:
     def _frames(self) -> FramePattern:
         samples, pattern = self.samples, self.pattern
         row, count = samples.views.row(samples.frame), len(samples.views.frames)
-        return FramePattern(pattern.corners[pattern.compact], row, pattern.vertex_count, count)
+        return FramePattern(pattern.corners[pattern.compact], row, len(pattern.vertices), count)
 
     def _brightened(self, log_gain: np.ndarray) -> Samples:
         """The trial samples with frames brighter by ``log_gain`` [F]."""
@@ -311,7 +315,7 @@ class GaussNewton:
     ) -> tuple[Tensor, Tensor]:
         """Steps of the table, and of what is shared along ``free`` [G, K], beside a scale of the albedo by
         which that of the channel ``kept`` stays on the whole what it is; None: by which it is as found."""
-        link, adjoint = state.link_slope[..., None], self._operator.adjoint_csr
+        link, adjoint = state.link_slope[self._told][..., None], self._at_told.adjoint_csr
         shape, joint = (len(state.table), CHANNELS, -1), free.shape[1] > 0
         sums = (equations.right * link * scale).reshape(len(link), -1)
         sums = (adjoint @ sums).reshape(shape)
@@ -319,7 +323,7 @@ class GaussNewton:
 
         def product(x: Tensor) -> Tensor:
             rows, _, columns = x.shape
-            vertex = (self._operator.forward_csr @ x.reshape(rows, -1)).reshape(-1, CHANNELS, columns)
+            vertex = (self._at_told.forward_csr @ x.reshape(rows, -1)).reshape(-1, CHANNELS, columns)
             vertex = link * (equations @ (link * vertex)) * scale
             back = adjoint @ vertex.reshape(len(vertex), -1)
             found = back.reshape(rows, CHANNELS, columns) + self.precision[..., None] * x
@@ -355,7 +359,7 @@ class GaussNewton:
         it follows none."""
         if not self._follows:
             return None
-        along = self._operator.adjoint_csr @ self._whiteness(state)
+        along = self._at_told.adjoint_csr @ self._whiteness(state)
         inner = self._placed_matrix(scale * equations.shared[-3:, -3:])
         turn = Following.turning(kept).to(self._device)
         return Following(along, turn, sums[..., -3:].contiguous(), inner)
@@ -366,10 +370,9 @@ class GaussNewton:
         return self.samples.bounce is not None and self.samples.bounce.shown is not None
 
     def _whiteness(self, state: State) -> Tensor:
-        """d mean ln of each channel of what photos tell of / dθ, [V, 3]."""
-        told = torch.ones(len(state.materials)) if state.told is None else state.told
-        share = (told / told.sum()).to(self._device)[:, None]
-        return share * state.link_slope[:, :3] / state.materials[:, :3]
+        """d mean ln of each channel / dθ of the vertices that photos tell of, [V, 3]."""
+        slope, material = (each[self._told, :3] for each in (state.link_slope, state.materials))
+        return slope / material / len(self._told)
 
     def _placed_matrix(self, values: np.ndarray) -> Tensor:
         return torch.from_numpy(values).float().to(self._device)

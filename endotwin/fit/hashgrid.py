@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import scipy.sparse
@@ -105,12 +106,11 @@ class HashOperator:
     Only slots that some point uses have a row in the table.
 
     Attributes:
-        forward_csr: A, torch sparse CSR float32 [V, R]. adjoint_csr: Aᵀ, [R, V].
+        forward_csr: A, torch sparse CSR float32 [V, R].
         level, slot: int64 [R], level and hash slot of each row, ascending. cells_mm: float64 [levels].
     """
 
     forward_csr: Tensor
-    adjoint_csr: Tensor
     level: np.ndarray
     slot: np.ndarray
     cells_mm: np.ndarray
@@ -137,7 +137,6 @@ class HashOperator:
         )
         return cls(
             to_torch(matrix),
-            to_torch(matrix.T),
             np.concatenate(level),
             np.concatenate(slots),
             grid.cells_mm,
@@ -148,11 +147,20 @@ class HashOperator:
     def each(cls, count: int, cell_mm: float) -> HashOperator:
         """The identity: each of ``count`` points has a row of its own, as in a cell of edge ``cell_mm``."""
         one = to_torch(scipy.sparse.identity(count, np.float32, "csr"))
-        return cls(one, one, np.zeros(count, np.int64), np.arange(count), np.array([cell_mm]), 0)
+        return cls(one, np.zeros(count, np.int64), np.arange(count), np.array([cell_mm]), 0)
 
     def to(self, device: torch.device) -> HashOperator:
         """The same operator, its matrices on ``device``."""
-        return replace(self, forward_csr=self.forward_csr.to(device), adjoint_csr=self.adjoint_csr.to(device))
+        return replace(self, forward_csr=self.forward_csr.to(device))
+
+    def of_points(self, points: np.ndarray) -> HashOperator:
+        """The operator of some of its points, int [N], and the same table."""
+        return replace(self, forward_csr=to_torch(_to_scipy(self.forward_csr)[points]))
+
+    @cached_property
+    def adjoint_csr(self) -> Tensor:
+        """Aᵀ, [R, V]."""
+        return to_torch(_to_scipy(self.forward_csr.cpu()).T).to(self.forward_csr.device)
 
     def __call__(self, table: Tensor) -> Tensor:
         """Features [V, C] = A·table [R, C], differentiable; the gradient is Aᵀ·g."""
@@ -197,3 +205,9 @@ def to_torch(matrix) -> Tensor:
         matrix.shape,
         check_invariants=False,
     )
+
+
+def _to_scipy(matrix: Tensor) -> scipy.sparse.csr_matrix:
+    """A torch sparse CSR tensor on the CPU as a scipy matrix of the same memory."""
+    parts = matrix.values(), matrix.col_indices(), matrix.crow_indices()
+    return scipy.sparse.csr_matrix(tuple(part.numpy() for part in parts), tuple(matrix.shape))

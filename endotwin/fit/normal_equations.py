@@ -1,8 +1,7 @@
 """Normal equations of one Gauss–Newton step over vertex materials and shared parameters.
 
-Each pixel touches the three vertices of its triangle, so the normal matrix of a material channel has the
-sparsity of the mesh. Base colours of different channels do not meet; roughness meets all three. Shared
-parameters border it.
+The normal matrix has the sparsity of the mesh (``mesh_pattern``). Base colours of different channels do not
+meet; roughness meets all three. Shared parameters border it.
 """
 
 from __future__ import annotations
@@ -15,6 +14,7 @@ import torch
 from torch import Tensor
 
 from endotwin.fit.frame_gains import FrameBorder, FramePattern, FrameSums
+from endotwin.fit.mesh_pattern import CORNER_PAIRS, MeshPattern, lumped, pairs_of
 from endotwin.fit.model import Globals, at_pixels, columns_of, linearise
 from endotwin.pixels.samples import Samples
 from endotwin.pixels.start import DIFFUSE_SIN2
@@ -23,7 +23,9 @@ from endotwin.run.ahead import on_all_cores
 CHANNELS = 4
 """Base colour red, green, blue; roughness."""
 
-CORNER_PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
+PLACES = ((0, -1, -1, 3), (-1, 1, -1, 4), (-1, -1, 2, 5), (3, 4, 5, 6))
+"""Which of the sums of ``_Products.pairs`` are those of two channels: base colours do not meet."""
+
 CHUNK = 1 << 16
 CLIPPED = 255
 
@@ -54,60 +56,18 @@ def robust_cost(samples: Samples, predicted: Tensor, width: float) -> float:
     return float((width**2 * (torch.sqrt(1 + (error / width) ** 2) - 1)).sum())
 
 
-class MeshPattern:
-    """Where the products of a sample set land in a vertex × vertex matrix."""
-
-    def __init__(self, samples: Samples, triangles: np.ndarray, vertex_count: int):
-        self.vertex_count = vertex_count
-        hit, self.compact = np.unique(samples.triangle.numpy(), return_inverse=True)
-        self.corners = triangles[hit]
-        both = [(k, *pair) for k, (i, j) in enumerate(CORNER_PAIRS) for pair in sorted({(i, j), (j, i)})]
-        entry = np.concatenate([len(CORNER_PAIRS) * np.arange(len(hit)) + k for k, _, _ in both])
-        key = np.concatenate(
-            [self.corners[:, i].astype(np.int64) * vertex_count + self.corners[:, j] for _, i, j in both]
-        )
-        order = np.argsort(key, kind="stable")
-        key, self._entry = key[order], entry[order]
-        self._segments = np.flatnonzero(np.r_[True, key[1:] != key[:-1]])
-        row, column = np.divmod(key[self._segments], vertex_count)
-        pointers = np.searchsorted(row, np.arange(vertex_count + 1))
-        self._pointers, self._indices = (torch.from_numpy(x.astype(np.int32)) for x in (pointers, column))
-
-    @property
-    def told(self) -> Tensor:
-        """Bool [V], corners of triangles that samples show."""
-        return torch.from_numpy(np.bincount(self.corners.ravel(), minlength=self.vertex_count) > 0)
-
-    def matrix(self, pair_sums: np.ndarray) -> Tensor:
-        """Symmetric CSR [V, V] from sums [T, 6] of weighted products of barycentrics, by CORNER_PAIRS."""
-        values = pair_sums.reshape(-1)[self._entry]
-        data = np.add.reduceat(values, self._segments) if len(values) else values
-        shape = (self.vertex_count, self.vertex_count)
-        parts = (self._pointers, self._indices, torch.from_numpy(data.astype(np.float32)))
-        return torch.sparse_csr_tensor(*parts, shape, check_invariants=False)
-
-    def vector(self, corner_sums: np.ndarray) -> np.ndarray:
-        """Vertex sums [V, C] from triangle corner sums [T, 3, C]."""
-        flat = corner_sums.reshape(-1, corner_sums.shape[2])
-        ids = self.corners.reshape(-1)
-        return np.stack([np.bincount(ids, column, self.vertex_count) for column in flat.T], axis=1)
-
-
 @dataclass(frozen=True)
 class NormalEquations:
-    """JᵀWJ and JᵀWe of one linearisation.
+    """JᵀWJ and JᵀWe of one linearisation, by the V vertices that photos tell of (``MeshPattern.vertices``).
 
     Attributes:
-        color: three CSR [V, V], base colour by base colour. mixed: three CSR, base colour by roughness.
-        roughness: CSR [V, V].
+        matrix: CSR [4·V, 4·V], a vertex' channels one after the other.
         right: float32 [V, 4, 1 + G], JᵀW(e | dC by the G columns of ``Linearised.by_shared``) by channel.
         shared: float64 [G, G] and shared_right [G], those of the G columns.
         gains: of frames, eliminated from all of them; None: there are none.
     """
 
-    color: list[Tensor]
-    mixed: list[Tensor]
-    roughness: Tensor
+    matrix: Tensor
     right: Tensor
     shared: np.ndarray
     shared_right: np.ndarray
@@ -126,27 +86,12 @@ class NormalEquations:
 
     def __matmul__(self, values: Tensor) -> Tensor:
         """Product with vertex values [V, 4, K]."""
-        v = [values[:, channel].contiguous() for channel in range(CHANNELS)]
-        rows = [self.color[c] @ v[c] + self.mixed[c] @ v[3] for c in range(3)]
-        rows.append(self.roughness @ v[3] + sum(self.mixed[c] @ v[c] for c in range(3)))
-        product = torch.stack(rows, dim=1)
+        product = (self.matrix @ values.reshape(len(self.matrix), -1)).reshape(values.shape)
         return product if self.gains is None else product - self.gains.product(values)
 
     def lumped(self) -> Tensor:
         """Row sums as one symmetric 4×4 block a vertex, [V, 4, 4]."""
-        ones = torch.ones(self.right.shape[0], 1, device=self.right.device)
-        block = torch.zeros(self.right.shape[0], CHANNELS, CHANNELS, device=self.right.device)
-        for c in range(3):
-            block[:, c, c] = (self.color[c] @ ones)[:, 0]
-            block[:, c, 3] = block[:, 3, c] = (self.mixed[c] @ ones)[:, 0]
-        block[:, 3, 3] = (self.roughness @ ones)[:, 0]
-        return block
-
-
-def pairs_of(corner: Tensor) -> Tensor:
-    """Products of barycentrics [N, 3] by CORNER_PAIRS, [N, 6]."""
-    first, second = np.transpose(CORNER_PAIRS)
-    return corner[:, first] * corner[:, second]
+        return lumped(self.matrix, CHANNELS)
 
 
 Part = tuple[Tensor, Tensor]
@@ -285,12 +230,8 @@ def assemble(
         normal += part.normal
         right += part.right
     vertex = pattern.vector(corner_sums.cpu().numpy()).astype(np.float32)
-    pair_sums = pair_sums.cpu().numpy()
-    matrices = [pattern.matrix(pair_sums[:, :, k]).to(device) for k in range(7)]
     equations = NormalEquations(
-        color=matrices[:3],
-        mixed=matrices[3:6],
-        roughness=matrices[6],
+        matrix=pattern.matrix(pair_sums.cpu().numpy(), PLACES).to(device),
         right=torch.from_numpy(vertex).to(device).reshape(-1, CHANNELS, 1 + globals_count),
         shared=normal,
         shared_right=right,

@@ -16,8 +16,9 @@ from torch import Tensor
 from endotwin.effects import Effects
 from endotwin.fit.gauss_newton import HUBER, TEMPER, GaussNewton
 from endotwin.fit.linear import conjugate_gradients
+from endotwin.fit.mesh_pattern import lumped, pairs_of
 from endotwin.fit.model import at_pixels, displayed, glow, radiance
-from endotwin.fit.normal_equations import CHUNK, Part, Residual, add, pairs_of, summed_products
+from endotwin.fit.normal_equations import CHUNK, Part, Residual, add, summed_products
 from endotwin.fit.state import State
 from endotwin.light.guides import Incoming
 from endotwin.light.incidence import COS_MIN
@@ -38,6 +39,8 @@ STEEP_DEG, STEEP = 0.1, 5.0
 LEAST_STEEP = 100
 
 AXIS_PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
+AXIS_PLACES = ((0, 3, 4), (3, 1, 5), (4, 5, 2))
+"""Of the world's axes, and where each two stand among these pairs."""
 
 
 @dataclass(frozen=True)
@@ -54,20 +57,17 @@ class Tilter:
         pattern, noise = self.solver.pattern, self.solver.noise(self.state)
         scale = 1 / (noise**2 * TEMPER)
         sums, right = self._assembled(normals, noise, self._between(normals, noise))
-        blocks = {pair: pattern.matrix(sums[:, :, k] * scale) for k, pair in enumerate(AXIS_PAIRS)}
-        blocks |= {(j, i): block for (i, j), block in blocks.items()}
-        precision = 1 / np.radians(SPREAD_DEG) ** 2
+        matrix, precision = pattern.matrix(sums * scale, AXIS_PLACES), 1 / np.radians(SPREAD_DEG) ** 2
 
         def product(x: Tensor) -> Tensor:
-            rows = [sum(blocks[i, j] @ x[:, j] for j in range(3)) + precision * x[:, i] for i in range(3)]
-            return torch.stack(rows, dim=1)
+            return (matrix @ x.reshape(len(matrix), -1)).reshape(x.shape) + precision * x
 
-        ones = torch.ones(len(normals), 1)
-        lumped = torch.stack([blocks[i, j] @ ones for i in range(3) for j in range(3)], 1).reshape(-1, 3, 3)
-        inverse = torch.linalg.inv(lumped + precision * torch.eye(3))
+        inverse = torch.linalg.inv(lumped(matrix, 3) + precision * torch.eye(3))
         right = torch.from_numpy(pattern.vector(right).astype(np.float32) * np.float32(scale))
         tilt, _ = conjugate_gradients(product, right[..., None], inverse, self.solver.out_of_time)
-        return unit(normals + tilt[..., 0].numpy())
+        tilted = normals.copy()
+        tilted[pattern.vertices] = unit(normals[pattern.vertices] + tilt[..., 0].numpy())
+        return tilted
 
     def _between(self, normals: np.ndarray, noise: float) -> float:
         """Standard deviation in radians of a pixel's normal about that of its vertices, from pixels so steep
