@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 import torch
 
-from endotwin.fit import gauss_newton, hashgrid, linear, prior, solve, tilt
+from endotwin.fit import gauss_newton, hashgrid, linear, mesh_pattern, prior, solve, tilt
 from endotwin.fit import normal_equations as normal
 from endotwin.pixels import start
 from endotwin.pixels.samples import Samples
 
-MODULES = (hashgrid, gauss_newton, linear, normal, prior, solve, start, tilt)
+MODULES = (hashgrid, gauss_newton, linear, mesh_pattern, normal, prior, solve, start, tilt)
 
 
 class DoubleNumpy:
