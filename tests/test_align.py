@@ -18,6 +18,7 @@ from endotwin.align.photos import read_photos
 from endotwin.align.scene import SHADING_MEAN, Scene
 from endotwin.align.texture import sighted
 from endotwin.align.trajectory import compare
+from endotwin.align.views import View
 from endotwin.align.written import write_poses
 from endotwin.cameras import read_camera, write_camera
 from endotwin.config import STANDARD
@@ -89,9 +90,10 @@ def test_slopes_of_sighted_vertices_are_those_of_finite_differences(tube):
     light = SHADING_MEAN
     for k, size in enumerate((3e-4, 3e-4, 3e-4, 0.01, 0.01, 0.01, 5e-4, 5e-4, 5e-4)):
         bent = [sign * size * np.eye(9)[k] for sign in (-1, 0, 1)]
+        scenes = [scene.through(scene.camera.corrected(by[6:])) for by in bent]
         ends = [
-            sighted(scene.through(scene.camera.corrected(by[6:])), photo, moved(pose, by[:6]), 2.0)
-            for by in bent
+            sighted(seen, photo, View.of(seen, moved(pose, by[:6]), 2.0))
+            for seen, by in zip(scenes, bent, strict=True)
         ]
         common = set.intersection(*(set(end.vertex.tolist()) for end in ends))
         rows = [np.flatnonzero(np.isin(end.vertex, list(common))) for end in ends]

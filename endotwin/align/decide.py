@@ -95,7 +95,7 @@ class Aligner:
         self.frames = training[spread(len(training), PHOTOS)]
         judging = np.arange(len(self.frames)) % JUDGES == JUDGES // 2
         self.choosers, self.judges = self.frames[~judging], self.frames[judging]
-        self.caster, self.camera = caster, self.sequence.camera
+        self.caster, self.camera = caster.threaded(1), self.sequence.camera
         self.photos: dict = {}
         self._progress = progress or _silent
         self._looks, self._expected = 0, len(BLURS + LENS_BLURS + OWN_BLURS) + 1

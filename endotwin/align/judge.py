@@ -12,8 +12,10 @@ from endotwin.align.rims import rim
 from endotwin.align.scene import Scene
 from endotwin.align.solve import even, paint_of
 from endotwin.align.texture import sighted
+from endotwin.align.views import View
 from endotwin.align.within import Within, within
 from endotwin.robust import robust_std
+from endotwin.run.ahead import on_all_cores
 
 LEAST = 100
 """A photo judges by no fewer vertices, or pixels beside rims."""
@@ -73,19 +75,20 @@ def errors(
     their ``poses`` [N, 4, 4]."""
     texture = within(scene, photos, poses, choosers, sigma_px)
     paint = paint_of(scene, texture)
-    by_texture, by_rims = [], []
-    for judge in judges.tolist():
-        by_texture.append(_texture(scene, photos[judge], poses[judge], sigma_px, texture))
-        seen = rim(scene, photos[judge], poses[judge], sigma_px, paint, texture.light)
-        by_rims.append(even(seen)[0] if len(seen.residual) >= LEAST else None)
-    return Errors(by_texture, by_rims)
+
+    def one(judge: int) -> tuple[np.ndarray | None, np.ndarray | None]:
+        view = View.of(scene, poses[judge], sigma_px)
+        seen = rim(scene, photos[judge], view, paint, texture.light)
+        by_rims = even(seen)[0] if len(seen.residual) >= LEAST else None
+        return _texture(scene, photos[judge], view, texture), by_rims
+
+    found = list(on_all_cores(one, judges.tolist()))
+    return Errors([by_texture for by_texture, _ in found], [by_rims for _, by_rims in found])
 
 
-def _texture(
-    scene: Scene, photo: Photo, pose: np.ndarray, sigma_px: float, texture: Within
-) -> np.ndarray | None:
+def _texture(scene: Scene, photo: Photo, view: View, texture: Within) -> np.ndarray | None:
     """Residuals of one photo at the vertices that others painted, less each cell's median."""
-    seen = sighted(scene, photo, pose, sigma_px)
+    seen = sighted(scene, photo, view)
     left = seen.shown - seen.columns @ texture.light - texture.log_albedo[seen.vertex]
     known = np.isfinite(left)
     if known.sum() < LEAST:

@@ -15,11 +15,10 @@ from scipy.spatial import cKDTree
 
 from endotwin.align.photos import DARKEST, Photo, gradient, log_blurred
 from endotwin.align.scene import LEAST_COSINE, Scene, by_twist, shading_columns
+from endotwin.align.views import View, band_px
 from endotwin.light.incidence import incidence
-from endotwin.surface.silhouettes import dilated, discontinuities
-
-BAND_SIGMAS = 2.5
-"""A rim shows within so many widths of the blur."""
+from endotwin.run.threads import THREADS
+from endotwin.surface import Surface
 
 STRETCH_CELLS = 24
 """Cells across the image, in each of which either side of a rim has a brightness of its own."""
@@ -31,23 +30,18 @@ PAINT_MM = 2.5
 NEIGHBOURS = 3
 
 
-class Paint:
-    """ln of the albedo of cells of PAINT_MM, from ``log_albedo`` [V] at local ``points_mm`` [V, 3]."""
-
-    def __init__(self, points_mm: np.ndarray, log_albedo: np.ndarray, cell_mm: float = PAINT_MM):
-        cells = np.floor(points_mm / cell_mm).astype(np.int64)
-        _, group, count = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
-        group = group.reshape(-1)
-        self._level = np.bincount(group, log_albedo) / count
-        self._tree = cKDTree(np.stack([np.bincount(group, x) / count for x in points_mm.T], axis=1))
-
-    def at(self, points_mm: np.ndarray) -> np.ndarray:
-        """[N], at local points [N, 3]."""
-        distance_mm, which = self._tree.query(
-            points_mm, k=list(range(1, 1 + min(NEIGHBOURS, len(self._level)))), workers=2
-        )
-        weight = 1 / (distance_mm + PAINT_MM / 8) ** 2
-        return (self._level[which] * weight).sum(axis=1) / weight.sum(axis=1)
+def painted(surface: Surface, points_mm: np.ndarray, log_albedo: np.ndarray) -> np.ndarray:
+    """ln of the albedo of every vertex, float32 [V], even over cells of PAINT_MM, from ``log_albedo`` [N] at
+    local ``points_mm`` [N, 3]."""
+    cells = np.floor(points_mm / PAINT_MM).astype(np.int64)
+    _, group, count = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
+    group = group.reshape(-1)
+    level = np.bincount(group, log_albedo) / count
+    tree = cKDTree(np.stack([np.bincount(group, x) / count for x in points_mm.T], axis=1))
+    nearest = list(range(1, 1 + min(NEIGHBOURS, len(level))))
+    distance_mm, which = tree.query(surface.vertices_mm, nearest, workers=THREADS)
+    weight = 1 / (distance_mm + PAINT_MM / 8) ** 2
+    return ((level[which] * weight).sum(axis=1) / weight.sum(axis=1)).astype(np.float32)
 
 
 @dataclass(frozen=True)
@@ -65,24 +59,18 @@ class Rim:
     stretch: np.ndarray
 
 
-def rim(
-    scene: Scene, photo: Photo, T_world_camera: np.ndarray, sigma_px: float, paint: Paint, light: np.ndarray
-) -> Rim:
-    """Rims in a photo from ``T_world_camera`` [4, 4], blurred by ``sigma_px``, under ``light`` [6]."""
-    (height, width), reach = scene.shape, int(np.ceil(BAND_SIGMAS * sigma_px))
-    hits = scene.caster.cast(scene.camera, T_world_camera)
-    distances = scene.distances(hits)
-    inside = ~dilated(distances == 0, 1)
-    band = dilated(discontinuities(distances) & inside, reach)
-    hits = hits[dilated(band, reach).reshape(-1)[hits.pixel]]
+def rim(scene: Scene, photo: Photo, view: View, paint: np.ndarray, light: np.ndarray) -> Rim:
+    """Rims in a photo, blurred as the ``view`` of it is, beside the twin that ``paint`` [V] (see ``painted``)
+    makes under ``light`` [6]."""
+    (height, width), distances, hits = scene.shape, view.distances, view.hits
     twin, met = np.zeros(height * width, np.float32), np.zeros(height * width, np.float32)
-    twin[hits.pixel], met[hits.pixel] = _shaded(scene, hits, T_world_camera, paint, light), 1
+    twin[hits.pixel], met[hits.pixel] = _shaded(scene, view, paint, light), 1
     twin, met = twin.reshape(height, width), met.reshape(height, width)
 
-    shown, holds = photo.blurred(sigma_px, met)
-    predicted, told = log_blurred(twin, met * photo.shown, sigma_px)
-    pixel = np.flatnonzero(band & holds & told & (predicted > np.log(DARKEST)))
-    nearest_mm = least_within(distances, reach).reshape(-1)[pixel].astype(np.float64)
+    shown, holds = photo.blurred(view.sigma_px, met)
+    predicted, told = log_blurred(twin, met * photo.shown, view.sigma_px)
+    pixel = np.flatnonzero(view.band & holds & told & (predicted > np.log(DARKEST)))
+    nearest_mm = least_within(distances, band_px(view.sigma_px)).reshape(-1)[pixel].astype(np.float64)
     slopes = moving_slopes(scene, predicted, pixel, nearest_mm)
     far = distances.reshape(-1)[pixel] > FARTHER * nearest_mm
     cell_px = width / STRETCH_CELLS
@@ -110,12 +98,11 @@ def least_within(distances: np.ndarray, reach: int) -> np.ndarray:
     return cv2.erode(beyond, np.ones((2 * reach + 1,) * 2, np.uint8))
 
 
-def _shaded(scene: Scene, hits, T_world_camera: np.ndarray, paint: Paint, light: np.ndarray) -> np.ndarray:
-    """Display value [N] of hits under ``light`` [6]."""
-    lit = incidence(hits, scene.surface, scene.camera, T_world_camera)
+def _shaded(scene: Scene, view: View, paint: np.ndarray, light: np.ndarray) -> np.ndarray:
+    """Display value [N] of the view's hits under ``light`` [6]."""
+    hits = view.hits
+    lit = incidence(hits, scene.surface, scene.camera, view.T_world_camera)
     ray = scene.rays[hits.pixel]
-    T = scene.surface.to_local(T_world_camera)
-    points = (ray * hits.distance_mm[:, None]) @ T[:3, :3].T + T[:3, 3]
     r2 = scene.squared_radius(np.stack([hits.pixel % scene.shape[1], hits.pixel // scene.shape[1]], axis=1))
     columns = shading_columns(ray[:, 2], hits.distance_mm, np.maximum(lit.cos, LEAST_COSINE), r2)
-    return np.exp(paint.at(points) + columns @ light)
+    return np.exp(hits.interpolate(scene.surface, paint) + columns @ light)

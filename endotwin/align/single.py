@@ -9,8 +9,9 @@ import numpy as np
 from endotwin.align.corrections import pose_precision
 from endotwin.align.motion import moved, twists_between
 from endotwin.align.photos import DARKEST, Photo, log_blurred
-from endotwin.align.rims import BAND_SIGMAS, least_within, moving_slopes
+from endotwin.align.rims import least_within, moving_slopes
 from endotwin.align.scene import Scene
+from endotwin.align.views import band_px
 from endotwin.align.within import HUBER
 from endotwin.robust import robust_std
 
@@ -49,8 +50,7 @@ def placed(
         pixel = np.flatnonzero(holds & told & (predicted > np.log(DARKEST)))
         if len(pixel) < LEAST_PIXELS:
             return T_world_camera
-        reach = int(np.ceil(BAND_SIGMAS * sigma_px))
-        nearest_mm = least_within(distances, reach).reshape(-1)[pixel].astype(np.float64)
+        nearest_mm = least_within(distances, band_px(sigma_px)).reshape(-1)[pixel].astype(np.float64)
         slopes = moving_slopes(scene, predicted, pixel, nearest_mm)[:, :6]
         left = (shown - predicted).reshape(-1)[pixel].astype(np.float64)
         left -= np.median(left)

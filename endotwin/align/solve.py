@@ -18,7 +18,7 @@ from endotwin.align.corrections import (
     shared_spread,
 )
 from endotwin.align.photos import Photo
-from endotwin.align.rims import Paint, Rim, rim
+from endotwin.align.rims import Rim, painted, rim
 from endotwin.align.scene import Scene
 from endotwin.align.within import HUBER, ROUNDS, Within, within
 from endotwin.robust import robust_std
@@ -41,9 +41,10 @@ class Looked:
     rims: list[Rim]
 
 
-def paint_of(scene: Scene, texture: Within) -> Paint:
+def paint_of(scene: Scene, texture: Within) -> np.ndarray:
+    """What the ``texture`` of vertices that are looked at paints on all, see ``painted``."""
     known = np.isfinite(texture.log_albedo)
-    return Paint(scene.points_mm[known], texture.log_albedo[known])
+    return painted(scene.surface, scene.points_mm[known], texture.log_albedo[known])
 
 
 def look(
@@ -52,9 +53,8 @@ def look(
     """What the photos of ``frames`` [F] tell about their ``poses`` [N, 4, 4], blurred by ``sigma_px``."""
     texture = within(scene, photos, poses, frames, sigma_px)
     paint = paint_of(scene, texture)
-    found = ahead(
-        lambda f: rim(scene, photos[f], poses[f], sigma_px, paint, texture.light), frames.tolist(), THREADS
-    )
+    seen = zip(frames.tolist(), texture.views, strict=True)
+    found = ahead(lambda each: rim(scene, photos[each[0]], each[1], paint, texture.light), seen, THREADS)
     matrix, right = texture.normal_equations(len(frames))
     matrix, right = matrix / TEXTURE_ALIKE, right / TEXTURE_ALIKE
     alike = RIM_ALIKE * 4 * np.pi * sigma_px**2

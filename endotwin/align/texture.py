@@ -10,7 +10,8 @@ import numpy as np
 
 from endotwin.align.photos import Photo, gradient
 from endotwin.align.scene import Scene, by_twist, shading_columns, shading_slopes
-from endotwin.surface.silhouettes import dilated, discontinuities
+from endotwin.align.views import View
+from endotwin.surface.silhouettes import dilated
 
 GRAZING, SHINY = 0.1, 0.92
 """Least and largest n·ω of a vertex that tells: beyond, it lies at a rim, or in a highlight."""
@@ -53,9 +54,9 @@ class Sighted:
         return np.hstack([self.by_twist - shading, self.by_intrinsics])
 
 
-def sighted(scene: Scene, photo: Photo, T_world_camera: np.ndarray, sigma_px: float) -> Sighted:
-    """The scene's vertices in a photo from ``T_world_camera`` [4, 4], blurred by ``sigma_px``."""
-    T = scene.surface.to_local(T_world_camera)
+def sighted(scene: Scene, photo: Photo, view: View) -> Sighted:
+    """The scene's vertices in a photo, blurred as the ``view`` of it is."""
+    T = scene.surface.to_local(view.T_world_camera)
     points = (scene.points_mm - T[:3, 3]) @ T[:3, :3]
     normals = scene.normals @ T[:3, :3]
     distance_mm = np.linalg.norm(points, axis=1)
@@ -67,13 +68,12 @@ def sighted(scene: Scene, photo: Photo, T_world_camera: np.ndarray, sigma_px: fl
         inside = ((uv >= 1) & (uv < (width - 2, height - 2))).all(axis=1)
     rows, uv = rows[inside], uv[inside]
 
-    shown, holds = photo.blurred(sigma_px)
-    distances = scene.distances(scene.caster.cast(scene.camera, T_world_camera))
-    rims = discontinuities(distances) | (distances == 0)
-    holds &= ~dilated(rims, int(np.ceil(RIM_SIGMAS * sigma_px)))
+    shown, holds = photo.blurred(view.sigma_px)
+    rims = view.ends | (view.distances == 0)
+    holds &= ~dilated(rims, int(np.ceil(RIM_SIGMAS * view.sigma_px)))
     nearest = np.rint(uv).astype(int)
     pixel = nearest[:, 1] * width + nearest[:, 0]
-    before = distances.reshape(-1)[pixel]
+    before = view.distances.reshape(-1)[pixel]
     clear = before * (1 + OCCLUDED) + _reach(scene, before, cos[rows]) > distance_mm[rows]
     keep = holds.reshape(-1)[pixel] & clear
     rows, uv, pixel = rows[keep], uv[keep].astype(np.float32), pixel[keep]

@@ -10,7 +10,8 @@ import numpy as np
 from endotwin.align.coupled import coupled
 from endotwin.align.photos import Photo
 from endotwin.align.scene import SHADING, SHADING_MEAN, SHADING_SPREAD, Scene
-from endotwin.align.texture import LIGHT_CELLS, sighted
+from endotwin.align.texture import LIGHT_CELLS, Sighted, sighted
+from endotwin.align.views import View
 from endotwin.robust import robust_std
 from endotwin.run.ahead import ahead
 from endotwin.run.threads import THREADS
@@ -25,12 +26,14 @@ class Within:
     """N sightings in F photos.
 
     Attributes:
-        vertex, photo, cell: int [N]; ``cell`` counts those of all photos. slopes: float32 [N, 9].
+        views: of the photos [F]. slopes: float32 [N, 9].
+        vertex, photo, cell: int [N]; ``cell`` counts those of all photos.
         residual: float64 [N], ln photo less shading, vertex and cell. weight: [N], at most 1. width: of the
             residuals. light: [6], coefficients of the shading. log_albedo: [V], of the scene's vertices, NaN
             unseen.
     """
 
+    views: list[View]
     vertex: np.ndarray
     photo: np.ndarray
     cell: np.ndarray
@@ -53,7 +56,15 @@ def within(
     scene: Scene, photos: dict[int, Photo], poses: np.ndarray, frames: np.ndarray, sigma_px: float
 ) -> Within:
     """Sightings in the photos of ``frames`` [F], whose poses are ``poses`` [N, 4, 4] by frame."""
-    seen = list(ahead(lambda f: sighted(scene, photos[f], poses[f], sigma_px), frames.tolist(), THREADS))
+    views, seen = [], []
+
+    def one(frame: int) -> tuple[View, Sighted]:
+        view = View.of(scene, poses[frame], sigma_px)
+        return view, sighted(scene, photos[frame], view)
+
+    for view, part in ahead(one, frames.tolist(), THREADS):
+        views.append(view)
+        seen.append(part)
     photo = np.repeat(np.arange(len(seen)), [len(part.vertex) for part in seen])
     vertex = np.concatenate([part.vertex for part in seen])
     often = np.bincount(vertex, minlength=len(scene.vertices))[vertex] > 1
@@ -68,7 +79,7 @@ def within(
     slopes = np.concatenate([part.slopes(light) for part in seen])
     slopes = np.stack([x - groups.of_cells(x, weight)[cell] for x in slopes.T], axis=1).astype(np.float32)
     weight = np.where(often, weight, 0.0)
-    return Within(vertex, photo, cell, slopes, residual, weight, width, light, log_albedo)
+    return Within(views, vertex, photo, cell, slopes, residual, weight, width, light, log_albedo)
 
 
 @dataclass(frozen=True)
