@@ -211,36 +211,31 @@ def registered_wrongly(twin: Twin, folder: Path, twist: np.ndarray, intrinsics: 
 
 
 @pytest.mark.slow
-def test_a_hand_eye_error_is_found_and_held_out_photos_gain(fused, tmp_path, capsys):
+def test_a_hand_eye_error_is_found_and_held_out_photos_gain(fused, tmp_path):
     twist = np.r_[np.radians([0.1, -0.1, 0.07]), 0.2, -0.2, 0.15]
     true = registered_wrongly(fused(), tmp_path / "spoilt", twist, np.zeros(3))
-    write_c3vd_poses(tmp_path / "true.txt", true)
     assert invoke("fuse", tmp_path / "spoilt", "-o", tmp_path / "twin") == 0
     quickly = {
         "effects": dict.fromkeys(("offset", "interreflection", "gain", "coat", "tone"), "off"),
         "config": replace(STANDARD.fit, pixels=400_000, steps=1, tilts=0),
     }
     plain = endotwin.evaluate(endotwin.fit_twin(tmp_path / "twin", align="off", **quickly))
-    assert (
-        invoke(
-            "align", tmp_path / "twin", "--poses", tmp_path / "new.txt", "--against", tmp_path / "true.txt"
-        )
-        == 0
-    )
-    assert "as aligned: ATE" in capsys.readouterr().out
-    found = compare(read_c3vd_poses(tmp_path / "new.txt"), true)
-    before = compare(moved(true, -twist), true)
+    aligned = endotwin.fit_twin(tmp_path / "twin", **quickly)
+    found, before = (compare(each, true) for each in (aligned.sequence().T_world_camera, moved(true, -twist)))
     assert found.ate_mm < before.ate_mm / 2
-    aligned = endotwin.evaluate(endotwin.fit_twin(tmp_path / "twin", **quickly))
-    assert aligned.psnr_covered > plain.psnr_covered + 2
+    assert endotwin.evaluate(aligned).psnr_covered > plain.psnr_covered + 2
 
 
 @pytest.mark.slow
-def test_a_calibration_that_is_not_the_photos_is_put_right(fused, tmp_path):
+def test_a_calibration_that_is_not_the_photos_is_put_right(fused, tmp_path, capsys):
     twin = fused()
-    registered_wrongly(twin, tmp_path / "spoilt", np.zeros(6), np.array([0.01, 0.005, 0.0]))
+    true_poses = registered_wrongly(twin, tmp_path / "spoilt", np.zeros(6), np.array([0.01, 0.005, 0.0]))
+    write_c3vd_poses(tmp_path / "true.txt", true_poses)
     assert invoke("fuse", tmp_path / "spoilt", "-o", tmp_path / "twin") == 0
-    assert invoke("align", tmp_path / "twin", "--camera", tmp_path / "camera.json") == 0
+    written = "--camera", tmp_path / "camera.json", "--poses", tmp_path / "new.txt"
+    assert invoke("align", tmp_path / "twin", *written, "--against", tmp_path / "true.txt") == 0
+    assert "as aligned: ATE" in capsys.readouterr().out
+    assert compare(read_c3vd_poses(tmp_path / "new.txt"), true_poses).ate_mm < 0.1
     found, true = read_camera(tmp_path / "camera.json"), twin.camera
     written = read_camera(tmp_path / "spoilt" / "camera.json")
     assert abs(found.fx - true.fx) < 0.5 * abs(written.fx - true.fx)
