@@ -4,6 +4,7 @@ import shutil
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import tube_sequence
@@ -184,10 +185,22 @@ def test_corrected_poses_are_read_back(tube, tmp_path, format):
     np.testing.assert_allclose(read_poses(tmp_path / "poses.txt")[0], sequence.T_world_camera, atol=1e-9)
 
 
+@pytest.mark.parametrize("blank", [{0: 0, 4: 255}, dict.fromkeys(range(10), 255)], ids=["two", "all"])
+def test_photos_that_show_nothing_ask_for_nothing(tmp_path, blank):
+    tube_sequence.write(tmp_path / "tube")
+    for frame, value in blank.items():
+        path = str(tmp_path / "tube" / f"{frame:04d}_color.png")
+        cv2.imwrite(path, np.full_like(cv2.imread(path), value))
+    aligned = endotwin.align_twin(endotwin.fuse_twin(tmp_path / "tube"), "on")
+    assert np.isfinite(aligned.sequence().T_world_camera).all()
+    if len(blank) == 10:
+        moved_by = twists_between(aligned.source.open().T_world_camera, aligned.sequence().T_world_camera)
+        assert np.abs(moved_by).max() < 1e-9
+
+
 def registered_wrongly(twin: Twin, folder: Path, twist: np.ndarray, intrinsics: np.ndarray) -> np.ndarray:
     """The example's photos beside depth of its surface at other poses, which a wrong hand-eye matrix gives,
     and through a wrong camera: what puts them right is ``twist`` [6] and ``intrinsics`` [3]."""
-    import cv2
     import tifffile
 
     from endotwin.surface.casting import Caster

@@ -32,7 +32,9 @@ NEIGHBOURS = 3
 
 def painted(surface: Surface, points_mm: np.ndarray, log_albedo: np.ndarray) -> np.ndarray:
     """ln of the albedo of every vertex, float32 [V], even over cells of PAINT_MM, from ``log_albedo`` [N] at
-    local ``points_mm`` [N, 3]."""
+    local ``points_mm`` [N, 3]; 0 where there are none."""
+    if not len(points_mm):
+        return np.zeros(len(surface.vertices_mm), np.float32)
     cells = np.floor(points_mm / PAINT_MM).astype(np.int64)
     _, group, count = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
     group = group.reshape(-1)

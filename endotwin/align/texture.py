@@ -78,10 +78,7 @@ def sighted(scene: Scene, photo: Photo, view: View) -> Sighted:
     keep = holds.reshape(-1)[pixel] & clear
     rows, uv, pixel = rows[keep], uv[keep].astype(np.float32), pixel[keep]
 
-    sampled = [
-        cv2.remap(image, uv[:, None, 0], uv[:, None, 1], cv2.INTER_LINEAR)[:, 0].astype(np.float64)
-        for image in (shown, *gradient(shown))
-    ]
+    sampled = [_sampled(image, uv) for image in (shown, *gradient(shown))]
     points, cos = points[rows], cos[rows]
     by_point = scene.by_point(pixel, *sampled[1:], points)
     cell_px = width / LIGHT_CELLS
@@ -93,6 +90,13 @@ def sighted(scene: Scene, photo: Photo, view: View) -> Sighted:
         *(rows, v * (LIGHT_CELLS + 1) + u, sampled[0], by_twist(by_point, points)),
         *(scene.by_intrinsics(uv, *sampled[1:]), columns, points, normals[rows], cos),
     )
+
+
+def _sampled(image: np.ndarray, uv: np.ndarray) -> np.ndarray:
+    """Of an image at pixels [N, 2], between them too: float64 [N]. OpenCV refuses to find none."""
+    if not len(uv):
+        return np.zeros(0)
+    return cv2.remap(image, uv[:, None, 0], uv[:, None, 1], cv2.INTER_LINEAR)[:, 0].astype(np.float64)
 
 
 def _reach(scene: Scene, distance_mm: np.ndarray, cos: np.ndarray) -> np.ndarray:
