@@ -5,8 +5,6 @@ Each pixel touches the three vertices of its triangle, so that these matrices ha
 
 from __future__ import annotations
 
-from functools import cache
-
 import numpy as np
 import scipy.sparse
 import torch
@@ -24,9 +22,10 @@ class MeshPattern:
     """Where the products of a sample set land.
 
     Attributes:
-        vertices: int64 [V], those of ``vertex_count`` that samples tell of, ascending.
-        corners: int [T, 3], of the triangles that samples show, numbers of these. compact: int [N], the
-            triangle of each sample.
+        told: bool [vertex_count], corners of triangles that samples show. vertices: int64 [V], which these
+            are, ascending.
+        corners: int [T, 3], of those triangles, numbers of ``vertices``. compact: int [N], the triangle of
+            each sample.
     """
 
     def __init__(self, samples: Samples, triangles: np.ndarray, vertex_count: int):
@@ -46,13 +45,15 @@ class MeshPattern:
         shape = (len(first), len(CORNER_PAIRS) * len(hit))
         ones = np.ones(len(entry), np.float32)
         self._summed = scipy.sparse.csr_array((ones, entry, np.r_[first, len(entry)]), shape=shape)
-        self._layout = cache(self._laid_out)
+        self._layouts: dict[Places, tuple[Tensor, Tensor, Tensor]] = {}
 
     def matrix(self, pair_sums: np.ndarray, places: Places) -> Tensor:
         """Symmetric CSR [C·V, C·V], a vertex' channels one after the other, from K sums [T, 6, K] of weighted
         products of barycentrics, by CORNER_PAIRS."""
         sums = self._summed @ pair_sums.reshape(-1, pair_sums.shape[2])
-        pointers, columns, source = self._layout(places)
+        if places not in self._layouts:
+            self._layouts[places] = self._laid_out(places)
+        pointers, columns, source = self._layouts[places]
         data = torch.from_numpy(sums.astype(np.float32, copy=False)).reshape(-1)[source]
         shape = (len(pointers) - 1,) * 2
         return torch.sparse_csr_tensor(pointers, columns, data, shape, check_invariants=False)

@@ -1,5 +1,6 @@
 """An effect is worth its place by more where the rest of the model errs by more."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -10,10 +11,11 @@ from endotwin.evidence.verdict import Verdict
 from endotwin.evidence.worth import worth
 
 
-def model(bounces: bool, varies: float = 0.0) -> SimpleNamespace:
-    """What is asked of a fitted model: whether light bounces, and ln of two frames' gains."""
+def model(bounces: bool, varies: float = 0.0, leaves: float = 0.005) -> SimpleNamespace:
+    """What is asked of a fitted model: whether light bounces, ln of two frames' gains, and what it leaves."""
     hypothesis = Hypothesis(bounced=object() if bounces else None)
-    return SimpleNamespace(hypothesis=hypothesis, log_gain=varies * np.array([-1.0, 1.0]))
+    effects = SimpleNamespace(width=leaves)
+    return SimpleNamespace(hypothesis=hypothesis, log_gain=varies * np.array([-1.0, 1.0]), effects=effects)
 
 
 def test_guides_that_gain_little_are_worth_their_place_only_where_no_light_bounces():
@@ -28,6 +30,14 @@ def test_beside_a_bounce_a_gain_has_to_vary_as_a_cameras_does_or_to_explain_half
     assert not worth("gain", usual, model(bounces=True, varies=0.02))
     assert worth("gain", usual, model(bounces=True, varies=0.1))
     assert worth("gain", plain, model(bounces=True, varies=0.02))
+
+
+def test_vignetting_that_explains_more_than_rounding_is_worth_its_place_however_much_is_left():
+    by_a_percent = Verdict(10 * np.log10(1 + 0.01), 5)
+    assert worth("vignetting", by_a_percent, model(bounces=True, leaves=0.012))
+    assert not worth("vignetting", by_a_percent, model(bounces=True, leaves=0.01))
+    assert not worth("vignetting", replace(by_a_percent, sigmas=2), model(bounces=True, leaves=0.012))
+    assert not worth("vignetting", replace(by_a_percent, possible=False), model(bounces=True, leaves=0.012))
 
 
 def test_a_bounce_that_pixels_hardly_tell_is_told_by_a_light_that_is_likelier():
