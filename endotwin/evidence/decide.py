@@ -103,7 +103,7 @@ class _Trial:
         self._decisions: dict[str, Decision] = {}
         self._seconds = dict.fromkeys((*TOGETHER, *BESIDE), 0.0)
         self._model, self._bouncing = cache(self._fitted), cache(self._bounced)
-        self._guides_mm, self._thrown_from_mm = {False: AT_LENS, True: AT_LENS}, AT_LENS
+        self._guides_mm = {False: AT_LENS, True: AT_LENS}
 
     def wanted(self, name: str) -> str:
         return self._wanted.get(name, "auto")
@@ -127,7 +127,7 @@ class _Trial:
 
     def _seek_guides(self, best: frozenset[str]) -> None:
         """Find the guides without and with bounced light, if there are any beside the ``best`` set without
-        them; at last beside the bounce of their own light, which hardly changes by what that moves them.
+        them; at last beside the bounce of their own light.
 
         A gain that is not worth its place would explain what guides throw, and hide where they are. Where
         bounced light is left out, a guide near the lens throws into the shadows what nothing else does, and
@@ -142,11 +142,10 @@ class _Trial:
             other = replace(base, bounced=None if bounces else self._bouncing(AT_LENS))
             other_mm = self._found_guides(other, False)
         self._guides_mm = {bounces: _first(found_mm, other_mm), not bounces: _first(other_mm, found_mm)}
-        self._thrown_from_mm = self._guides_mm[True]
         if not self._beside_lens or self.wanted("interreflection") == "off" or self._late():
             return
         own = Hypothesis(self._guides_mm[True], shadows=True, gain=base.gain)
-        own = replace(own, bounced=self._bouncing(self._thrown_from_mm))
+        own = replace(own, bounced=self._bouncing(own.guides_mm))
         self._guides_mm[True] = Search(self._ground.part, own).polished()
 
     def _found_guides(self, base: Hypothesis, forced: bool) -> Guides:
@@ -245,12 +244,11 @@ class _Trial:
     def _fitted(self, names: frozenset[str]) -> Fitted:
         began = time.perf_counter()
         hypothesis = Hypothesis(gain="gain" in names, vignetting=self.wanted("vignetting") != "off")
-        thrown_from_mm = AT_LENS
         if "offset" in names:
-            guides_mm, thrown_from_mm = self._guides_mm["interreflection" in names], self._thrown_from_mm
+            guides_mm = self._guides_mm["interreflection" in names]
             hypothesis = replace(hypothesis, guides_mm=guides_mm, shadows=True)
         if "interreflection" in names:
-            hypothesis = replace(hypothesis, bounced=self._bouncing(thrown_from_mm))
+            hypothesis = replace(hypothesis, bounced=self._bouncing(hypothesis.guides_mm))
         found = self._probe.fit(hypothesis)
         for name in names:
             self._seconds[name] += (time.perf_counter() - began) / len(names)
