@@ -19,10 +19,10 @@ from endotwin.effects.tone import Tone
 from endotwin.evaluation.evaluation import covered_pixels
 from endotwin.fit import fit
 from endotwin.fit.solve import median_edge_mm
-from endotwin.fit.steps import proxies
 from endotwin.pixels.pace import Pace
 from endotwin.pixels.samples import BLACK, frame_samples, gather
 from endotwin.surface.casting import Caster
+from endotwin.surface.cells import merged
 
 pytestmark = pytest.mark.slow
 
@@ -230,9 +230,9 @@ def test_options_that_make_no_sense_are_refused(tube, options, message):
         fit(tube, **options)
 
 
-def test_proxies_are_the_means_of_the_vertices_of_a_cell(tube):
+def test_merged_points_are_the_means_of_the_vertices_of_a_cell(tube):
     vertices_mm, cell_mm = tube.surface.vertices_mm, 1.5
-    points, group = proxies(vertices_mm, cell_mm)
+    points, group = merged(vertices_mm, cell_mm)
     assert len(points) == group.max() + 1 < len(vertices_mm)
     for number in (0, len(points) // 2, len(points) - 1):
         members = vertices_mm[group == number]

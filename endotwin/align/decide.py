@@ -230,7 +230,7 @@ def _keeps(verdict: Verdict, least_db: float = MIN_GAIN_DB, sigmas: float = MIN_
 
 def _cost_db(before: Looked, after: Looked) -> float:
     """By how much the robust widths of texture fell, dB."""
-    return 20 * float(np.log10(before.texture.width / after.texture.width))
+    return 20 * float(np.log10(before.width / after.width))
 
 
 def _registration(found: Corrections, with_depth: bool = False) -> Registration:

@@ -19,6 +19,7 @@ from endotwin.align.views import View, band_px
 from endotwin.light.incidence import incidence
 from endotwin.run.threads import THREADS
 from endotwin.surface import Surface
+from endotwin.surface.cells import merged
 
 STRETCH_CELLS = 24
 """Cells across the image, in each of which either side of a rim has a brightness of its own."""
@@ -35,13 +36,10 @@ def painted(surface: Surface, points_mm: np.ndarray, log_albedo: np.ndarray) -> 
     local ``points_mm`` [N, 3]; 0 where there are none."""
     if not len(points_mm):
         return np.zeros(len(surface.vertices_mm), np.float32)
-    cells = np.floor(points_mm / PAINT_MM).astype(np.int64)
-    _, group, count = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
-    group = group.reshape(-1)
-    level = np.bincount(group, log_albedo) / count
-    tree = cKDTree(np.stack([np.bincount(group, x) / count for x in points_mm.T], axis=1))
+    centre_mm, group = merged(points_mm, PAINT_MM)
+    level = np.bincount(group, log_albedo) / np.bincount(group)
     nearest = list(range(1, 1 + min(NEIGHBOURS, len(level))))
-    distance_mm, which = tree.query(surface.vertices_mm, nearest, workers=THREADS)
+    distance_mm, which = cKDTree(centre_mm).query(surface.vertices_mm, nearest, workers=THREADS)
     weight = 1 / (distance_mm + PAINT_MM / 8) ** 2
     return ((level[which] * weight).sum(axis=1) / weight.sum(axis=1)).astype(np.float32)
 

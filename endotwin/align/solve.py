@@ -33,12 +33,11 @@ rims."""
 @dataclass(frozen=True, eq=False)
 class Looked:
     """What F photos tell at one state of the corrections: matrix [F, 9, F, 9] and right-hand side [F, 9]; and
-    the terms that they came from."""
+    the robust ``width`` of what their texture is off by."""
 
     matrix: np.ndarray
     right: np.ndarray
-    texture: Within
-    rims: list[Rim]
+    width: float
 
 
 def paint_of(scene: Scene, texture: Within) -> np.ndarray:
@@ -58,12 +57,11 @@ def look(
     matrix, right = texture.normal_equations(len(frames))
     matrix, right = matrix / TEXTURE_ALIKE, right / TEXTURE_ALIKE
     alike = RIM_ALIKE * 4 * np.pi * sigma_px**2
-    rims = list(found)
-    for number, seen in enumerate(rims):
-        own, pull = rim_equations(seen)
+    for number, beside in enumerate(found):
+        own, pull = rim_equations(beside)
         matrix[number, :, number] += own / alike
         right[number] += pull / alike
-    return Looked(matrix, right, texture, rims)
+    return Looked(matrix, right, texture.width)
 
 
 def rim_equations(seen: Rim) -> tuple[np.ndarray, np.ndarray]:

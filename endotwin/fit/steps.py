@@ -18,6 +18,7 @@ from endotwin.light.shading import F0_DIELECTRIC, ROUGHNESS_TISSUE
 from endotwin.pixels.samples import Samples
 from endotwin.pixels.start import Start
 from endotwin.surface import Surface
+from endotwin.surface.cells import merged
 
 COARSEST_MM = 12.0
 """Of the cells of features, in units of the scene."""
@@ -39,20 +40,9 @@ def solver_of(
 ) -> tuple[GaussNewton, HashOperator]:
     """A solver for ``samples`` of the surface, beside features whose finest cells are ``cell_mm`` units of
     the scene, and their operator; ``options`` are the solver's."""
-    points, group = proxies(surface.vertices_mm, unit_mm * cell_mm / PROXIES)
-    operator = HashOperator.of(points, HashGrid(unit_mm * COARSEST_MM, unit_mm * cell_mm))
+    points, group = merged(surface.vertices_mm, unit_mm * cell_mm / PROXIES)
+    operator = HashOperator.of(points.astype(np.float32), HashGrid(unit_mm * COARSEST_MM, unit_mm * cell_mm))
     return GaussNewton(samples, group[surface.triangles], operator, unit_mm, **options), operator
-
-
-def proxies(vertices_mm: np.ndarray, cell_mm: float) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices [V, 3] merged by cells of edge ``cell_mm``: mean points float32 [P, 3], and the point of each
-    vertex [V].
-    """
-    cells = np.floor(vertices_mm / cell_mm).astype(np.int64)
-    _, group, count = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
-    group = group.reshape(-1)
-    sums = [np.bincount(group, vertices_mm[:, axis]) for axis in range(3)]
-    return (np.stack(sums, axis=1) / count[:, None]).astype(np.float32), group
 
 
 def started(

@@ -39,7 +39,7 @@ STEEP_DEG, STEEP = 0.1, 5.0
 LEAST_STEEP = 100
 
 AXIS_PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
-AXIS_PLACES = ((0, 3, 4), (3, 1, 5), (4, 5, 2))
+AXIS_PLACES = tuple(tuple(AXIS_PAIRS.index((min(i, j), max(i, j))) for j in range(3)) for i in range(3))
 """Of the world's axes, and where each two stand among these pairs."""
 
 
