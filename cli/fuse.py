@@ -59,6 +59,14 @@ def fuse(
             show_default="as photographed",
         ),
     ] = None,
+    without: Annotated[
+        str | None,
+        typer.Option(
+            metavar="12,17-19",
+            help="Leave these frames, of which the first is 0, out: neither fused nor fitted nor scored by.",
+            show_default="none",
+        ),
+    ] = None,
     geometry: Annotated[
         str,
         typer.Option(
@@ -75,12 +83,9 @@ def fuse(
     Example: endotwin fuse examples/colon_small -o twin
     """
     check_free(output, overwrite, TWIN)
-    plan, size = load_config(config).fuse, None
-    if undistort is not None:
-        found = re.fullmatch(r"(\d+)[x×](\d+)", undistort)
-        if found is None:
-            raise OptionError(f"the size '{undistort}' is not understood; write it as 640x480")
-        size = int(found[1]), int(found[2])
+    plan = load_config(config).fuse
+    size = None if undistort is None else _size(undistort)
+    left_out = () if without is None else _frames(without)
     with console.command("fuse", profile) as run:
         with run.stage("import"):
             from endotwin.pipeline import fuse_twin
@@ -94,6 +99,7 @@ def fuse(
                 config=plan,
                 progress=run.progress,
                 undistort=size,
+                without=left_out,
             )
         run.stopwatch.parts["fuse"] = twin.record["fuse"]["stages"]
         with run.stage("write"):
@@ -101,3 +107,21 @@ def fuse(
     surface = twin.surface
     seen = (surface.seen_by > 0).mean()
     print(f"wrote {output}: {surface}, {seen:.0%} of the vertices seen by training photos")
+
+
+def _size(text: str) -> tuple[int, int]:
+    found = re.fullmatch(r"(\d+)[x×](\d+)", text)
+    if found is None:
+        raise OptionError(f"the size '{text}' is not understood; write it as 640x480")
+    return int(found[1]), int(found[2])
+
+
+def _frames(text: str) -> set[int]:
+    """Numbers and ranges with both ends, joined by commas."""
+    frames = set()
+    for part in text.split(","):
+        found = re.fullmatch(r"\s*(\d{1,6})\s*(?:[-–]\s*(\d{1,6})\s*)?", part)
+        if found is None or int(found[2] or found[1]) < int(found[1]):
+            raise OptionError(f"the frames '{text}' are not understood; write them as 12,17-19")
+        frames.update(range(int(found[1]), int(found[2] or found[1]) + 1))
+    return frames

@@ -40,6 +40,7 @@ def fuse_twin(
     config: FuseConfig = STANDARD.fuse,
     progress: Progress | None = None,
     undistort: tuple[int, int] | None = None,
+    without: Iterable[int] = (),
 ) -> Twin:
     """Fuse the depth maps of a sequence into a twin that has a surface and no materials yet.
 
@@ -53,6 +54,7 @@ def fuse_twin(
         config: how finely to fuse.
         progress: called with (label, done, total).
         undistort: width and height of a pinhole image to resample to first, as published comparisons do.
+        without: indices of frames that are left out: neither fused nor fitted nor scored by.
 
     Raises:
         SequenceError, CameraError: the sequence cannot be used as it is.
@@ -76,9 +78,17 @@ def fuse_twin(
         split=sequence.split,
         undistort=undistort,
     )
+    if left_out := sorted(without):
+        for index in (left_out[0], left_out[-1]):
+            if not 0 <= index < len(sequence):
+                raise OptionError(
+                    f"{path} has no frame {index} to leave out: its frames are 0 to {len(sequence) - 1}"
+                )
+        source = source.without(left_out, len(sequence))
+        sequence = source.limited(sequence)
     training = source.training(len(sequence))
     if not training:
-        raise SequenceError(f"{path} has no frame to fit: every one is held out; use more frames")
+        raise SequenceError(f"{path} has no frame to fit: every one is held out or left out; use more frames")
     heldout = source.heldout(len(sequence)) if geometry == "known" else []
     frames = sorted({*training, *heldout})
 
@@ -94,8 +104,8 @@ def fuse_twin(
     stopwatch.lap(None)
     if not surface.seen_by.any():
         logger.warning("no training photo of %s shows the mesh: 'endotwin fit' has nothing to fit", path)
-    if len(sequence) == 1:
-        logger.warning("%s has one frame, which is fitted: none is left to score the twin by", path)
+    if not source.heldout(len(sequence)):
+        logger.warning("no frame of %s is held out: none is left to score the twin by", path)
     made = {
         "frames": len(frames),
         "voxel_mm": voxel_mm,

@@ -300,7 +300,7 @@ def test_photos_that_are_all_black(fails, tube, tmp_path):
 def test_a_sequence_of_one_frame_says_that_none_is_left_to_score_by(endotwin, tmp_path):
     tube_sequence.write(tmp_path / "tube", 1)
     code, _, err = endotwin("fuse", tmp_path / "tube", "-o", tmp_path / "twin")
-    assert code == 0 and "one frame" in err
+    assert code == 0 and "none is left to score the twin by" in err
 
 
 def test_an_unknown_camera_model(fails, tube, tmp_path):
@@ -419,6 +419,17 @@ def test_undistorted_frames_are_those_that_a_twin_is_made_of(endotwin, tube, tmp
     assert endotwin("fuse", tube, "-o", tmp_path / "twin", "--undistort", "48x36")[0] == 0
     document = json.loads((tmp_path / "twin" / "twin.json").read_text(encoding="utf-8"))
     assert (document["camera"]["width"], document["camera"]["height"]) == (48, 36)
+
+
+def test_frames_are_left_out_by_numbers_and_ranges(endotwin, tube, tmp_path):
+    assert endotwin("fuse", tube, "-o", tmp_path / "twin", "--without", "1, 3-4")[0] == 0
+    document = json.loads((tmp_path / "twin" / "twin.json").read_text(encoding="utf-8"))
+    assert not {1, 3, 4} & {*document["source"]["split"]["training"]}
+
+
+@pytest.mark.parametrize("frames", ("", "one", "4-2", "-1", "1,,2", "1-2-3"))
+def test_frames_that_are_no_numbers_and_ranges_are_refused(fails, tube, tmp_path, frames):
+    assert "write them as 12,17-19" in fails("fuse", tube, "-o", tmp_path / "twin", f"--without={frames}")
 
 
 def test_a_file_of_a_sequence_is_no_folder_of_one(fails, tube, tmp_path):

@@ -58,6 +58,21 @@ def test_held_out_photos_are_never_counted_or_fitted(tmp_path, monkeypatch):
     assert set(read) == {1, 2, 3, 4, 5, 6, 7}
 
 
+def test_frames_that_are_left_out_are_not_even_read_and_the_others_keep_their_part(tmp_path):
+    folder = tube_sequence.write(tmp_path / "tube", frames=9)
+    for name in ("0003_color.png", "0003_depth.tiff", "0008_color.png"):
+        (folder / name).write_bytes(b"torn")
+    endotwin.fit_twin(endotwin.fuse_twin(folder, without=[8, 3]), budget_s=1).save(tmp_path / "twin")
+    twin = endotwin.Twin.load(tmp_path / "twin")
+    assert (twin.source.training(9), twin.source.heldout(9)) == ([1, 2, 4, 5, 6, 7], [0])
+    assert twin.surface.seen_by.max() == 6
+    assert [frame.index for frame in endotwin.evaluate(twin).frames] == [0]
+    with pytest.raises(endotwin.EndotwinError, match="no frame 9 to leave out: its frames are 0 to 8"):
+        endotwin.fuse_twin(folder, without=[9])
+    with pytest.raises(endotwin.EndotwinError, match="no frame to fit"):
+        endotwin.fuse_twin(folder, without=range(1, 8))
+
+
 def test_a_saved_twin_opens_its_sequence_from_any_folder(tmp_path, monkeypatch):
     tube_sequence.write(tmp_path / "tube", frames=9)
     monkeypatch.chdir(tmp_path)

@@ -54,11 +54,11 @@ def test_a_photo_that_is_less_red_than_the_others_of_the_same_places_is_named_an
     assert 9 <= percent <= 15  # the places' own colour takes a share, as the other photos outvote this one
 
 
-def test_the_worst_photo_is_told_by_its_channel_and_those_beside_it_are_counted():
+def test_the_worst_photo_is_told_by_its_channel_and_those_beside_it_by_number():
     casts = np.full((9, 3), 0.01)  # what all have in common is no cast of any
     casts[4, 2], casts[7, 0], casts[8] = 0.2, -0.1, np.nan
     said = cast_warning(Remains(0.01, casts, np.arange(10, 19)))
-    assert said.startswith("photo 14 is 21 % more blue") and "(1 more are off)" in said
+    assert said.startswith("photo 14 is 21 % more blue") and "--without 14,17'" in said
     casts[[4, 7]] = 0.01
     assert cast_warning(Remains(0.01, casts, np.arange(10, 19))) is None
 

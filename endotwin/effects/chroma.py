@@ -12,7 +12,6 @@ from endotwin.effects.codec import Codec
 from endotwin.effects.effect import Effect
 from endotwin.effects.luma import LUMA
 from endotwin.sequence import Sequence
-from endotwin.sequence.spread import spread
 
 TO_RED, TO_BLUE = 1.402, 1.772
 """By which Cr and Cb are multiplied to be what red and blue have more than luminance (ITU-R BT.601)."""
@@ -63,7 +62,7 @@ class Chroma(Effect):
         broad detail has, or more, where noise of each channel or changes of hue add to it. That must be
         beyond what rounding leaves, and less than half of it be there.
         """
-        chosen = spread(len(sequence), PHOTOS)
+        chosen = sequence.spread(PHOTOS)
         lit = sequence.well_lit(MARGIN_PX)
         measured = [_details(sequence.color(index), lit) for index in chosen]
         broad, *finest = np.mean(measured, axis=0)

@@ -15,7 +15,6 @@ from endotwin.cameras import Camera
 from endotwin.effects.axis import principal_point_px
 from endotwin.effects.effect import Effect, parameter
 from endotwin.sequence import Sequence
-from endotwin.sequence.spread import spread
 
 FRAMES = 2
 FINE_PX, COARSE_PX = 1.5, 4.0
@@ -71,7 +70,7 @@ class Chromatic(Effect):
         pixels: D_c = a·D_g + b·(u − u₀)·∇D_g, with m_c − 1 = −b/a. The errors are a jackknife over tiles.
         Good to about 15%, since noise in D_g makes a too small.
         """
-        chosen = spread(len(sequence), frames)
+        chosen = sequence.spread(frames)
         sums = [_moments(sequence.color(i), sequence.lens_mask, sequence.camera) for i in chosen]
         red, blue = (_magnification(np.concatenate(channel)) for channel in zip(*sums, strict=True))
         return cls(red[0], blue[0]), cls(red[1], blue[1])

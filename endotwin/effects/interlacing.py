@@ -14,7 +14,6 @@ from endotwin.effects.effect import Effect
 from endotwin.effects.exposure import Shot
 from endotwin.effects.luma import LUMA
 from endotwin.sequence import Sequence
-from endotwin.sequence.spread import spread
 
 FIELDS = (-0.25, 0.25)
 """When the even and the odd rows are exposed, in frame intervals from the labelled pose."""
@@ -72,7 +71,7 @@ class Interlacing(Effect):
         across the rows as well as along them: combs must be beyond both an even chance and the columns'
         share, by Student's t of the frames' scatter, or of a coin's if that is more. A still camera has none.
         """
-        chosen = spread(len(sequence), FRAMES)
+        chosen = sequence.spread(FRAMES)
         lit = sequence.well_lit(MARGIN_PX)
         across, along = zip(*(_details(sequence.color(index), lit) for index in chosen), strict=True)
         (rows, rows_error, tiles), (columns, columns_error, _) = _share(across), _share(along)

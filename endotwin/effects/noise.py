@@ -14,7 +14,6 @@ from torch import Tensor
 
 from endotwin.effects.effect import Effect, parameter
 from endotwin.sequence import Sequence
-from endotwin.sequence.spread import spread
 
 LEVEL = 1 / 255
 """One step of an 8-bit image, in display values; rounding to it has the variance LEVEL²/12."""
@@ -69,7 +68,7 @@ class Noise(Effect):
     @classmethod
     def measured(cls, sequence: Sequence, frames: int = FRAMES) -> Noise | None:
         """The noise of ``frames`` photos spread over the sequence; see :meth:`measured_in`."""
-        photos = (sequence.color(index) for index in spread(len(sequence), frames))
+        photos = (sequence.color(index) for index in sequence.spread(frames))
         return cls.measured_in(photos, sequence.lens_mask)
 
     @classmethod

@@ -11,7 +11,6 @@ import numpy as np
 
 from endotwin.effects.effect import Effect, parameter
 from endotwin.sequence import Sequence
-from endotwin.sequence.spread import spread
 
 FONT, WEIGHT = cv2.FONT_HERSHEY_SIMPLEX, 12
 """Letters are so many times as high as their strokes are wide."""
@@ -85,7 +84,7 @@ def _edge_px(sequence: Sequence, leg_px: float) -> float:
 
     The surround that a mask tells is wider by as much as a codec or a sharpening processor reaches.
     """
-    chosen = spread(len(sequence), PHOTOS)
+    chosen = sequence.spread(PHOTOS)
     mean = np.mean([sequence.color(index).max(axis=2) for index in chosen], axis=0)
     x, y = (np.minimum(np.arange(size), np.arange(size)[::-1]) for size in mean.shape[::-1])
     line = x + y[:, None]

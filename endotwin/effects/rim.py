@@ -11,7 +11,6 @@ from scipy.special import ndtr, stdtrit
 
 from endotwin.effects.luma import LUMA
 from endotwin.sequence import Sequence
-from endotwin.sequence.spread import spread
 
 PHOTOS = 32
 """Spread over a sequence, whose rims are looked at."""
@@ -72,7 +71,7 @@ def unsharp(sequence: Sequence) -> Unsharp | None:
     distance_px, sector = _polar(sequence.lens_mask)
     if distance_px is None:
         return None
-    photos = (sequence.color(index) for index in spread(len(sequence), PHOTOS))
+    photos = (sequence.color(index) for index in sequence.spread(PHOTOS))
     found = np.concatenate([_profiles(photo, distance_px, sector) for photo in photos])
     found = found[np.argsort(found[:, 1])[:DIMMEST]]
     group, profiles = (found[:, 0] * GROUPS / SECTORS).astype(int), found[:, 2:]

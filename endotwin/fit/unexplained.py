@@ -65,9 +65,9 @@ class Remains:
 
 
 def cast_warning(remains: Remains) -> str | None:
-    """A sentence on the photo whose colour departs most from what the fit shows, and on how many others do;
-    None where all agree: white light, one exposure or fitted gains, and one colour of each place, leave none.
-    """
+    """A sentence on the photo whose colour departs most from what the fit shows, and how to leave it out with
+    the others that do; None where all agree: white light, one exposure or fitted gains, and one colour of
+    each place, leave none."""
     known = np.isfinite(remains.casts)
     if not known.any(axis=0).all():
         return None
@@ -79,11 +79,11 @@ def cast_warning(remains: Remains) -> str | None:
         return None
     worst, channel = np.unravel_index(size.argmax(), size.shape)
     change = np.expm1(off[worst, channel])
-    others = f" ({len(odd) - 1} more are off)" if len(odd) > 1 else ""
+    frames = ",".join(map(str, remains.frames[odd]))
     return (
         f"photo {remains.frames[worst]} is {100 * abs(change):.0f} % {'more' if change > 0 else 'less'} "
-        f"{('red', 'green', 'blue')[channel]} than the other photos of the same places{others}: was the "
-        f"white balance or the light another? Leave such photos out"
+        f"{('red', 'green', 'blue')[channel]} than the other photos of the same places: was the white "
+        f"balance or the light another? 'endotwin fuse --without {frames}' leaves out what is off so far"
     )
 
 

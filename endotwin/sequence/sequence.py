@@ -71,7 +71,7 @@ class Sequence:
         timestamps_s: float64 [N].
         scale: factor on the image size, 1 = native.
         image_size: (width, height) of the files; the camera's own unless given.
-        split: None where the files say nothing of one.
+        split: the frames that are used; None where the files say nothing of one: all are.
     """
 
     path: Path
@@ -146,6 +146,13 @@ class Sequence:
             T_world_camera=self.T_world_camera[index],
         )
 
+    def spread(self, most: int) -> np.ndarray:
+        """Indices of at most ``most`` of the frames that are used, evenly spread, int [N]."""
+        if self.split is None:
+            return spread(len(self), most)
+        used = [index for index in sorted({*self.split.training, *self.split.heldout}) if index < len(self)]
+        return np.array(used)[spread(len(used), most)]
+
     @cached_property
     def lens_mask(self) -> np.ndarray:
         """Bool [H, W]: pixels that the lens illuminates, false in an endoscope image's black surround.
@@ -153,7 +160,7 @@ class Sequence:
         Raises SequenceError if the photos looked at are all black.
         """
         brightest = np.zeros(self.image_size[::-1], np.uint8)
-        for index in spread(len(self), SURROUND_FRAMES):
+        for index in self.spread(SURROUND_FRAMES):
             np.maximum(brightest, self._native_color(index).max(axis=2), out=brightest)
         if brightest.max() <= SURROUND_LEVEL:
             raise SequenceError(f"{self.path} has only black photos; check that they show the lumen")

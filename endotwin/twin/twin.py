@@ -6,6 +6,7 @@ import hashlib
 import json
 import os
 import re
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
@@ -119,7 +120,8 @@ class Source:
             depth nor photo).
         holdout_every: every n-th frame, from the first, is held out of the fit.
         frames: of more training frames than these, so many are used, evenly spread; None: all.
-        split: the frames that the sequence itself says are to be fitted and held out, instead of every n-th.
+        split: the frames that are to be fitted and held out, where the sequence itself says so or some of its
+            frames are left out; else every n-th.
         undistort: width and height of the pinhole images that photos were resampled to; None: they were not.
     """
 
@@ -146,7 +148,11 @@ class Source:
                 f"{self.path}, from which the twin was made, is gone; put it back, or make the twin again "
                 "with 'endotwin fuse'"
             )
-        return open_sequence(Path(self.path), self.format, self.scale, self.undistort)
+        return self.limited(open_sequence(Path(self.path), self.format, self.scale, self.undistort))
+
+    def limited(self, sequence: Sequence) -> Sequence:
+        """The sequence, of which the frames that are left out are not looked at."""
+        return sequence if self.split is None else replace(sequence, split=self.split)
 
     def heldout(self, count: int) -> list[int]:
         """Indices of the held-out frames among ``count``; none where that would leave nothing to fit."""
@@ -156,12 +162,23 @@ class Source:
 
     def training(self, count: int) -> list[int]:
         """Indices of the frames whose photos may be fitted."""
-        heldout = set(self.heldout(count))
-        every = range(count) if self.split is None else self.split.training
-        training = [index for index in every if index < count and index not in heldout]
+        training = self._not_held_out(count)
         if self.frames is None or len(training) <= self.frames:
             return training
         return [training[i] for i in np.linspace(0, len(training) - 1, self.frames).round().astype(int)]
+
+    def without(self, left_out: Iterable[int], count: int) -> Source:
+        """The same source with the frames ``left_out`` of its ``count`` neither fitted nor held out; of the
+        others, those that were held out still are."""
+        left_out = set(left_out)
+        parts = self._not_held_out(count), self.heldout(count)
+        kept = (tuple(index for index in part if index not in left_out) for part in parts)
+        return replace(self, split=Split(*kept))
+
+    def _not_held_out(self, count: int) -> list[int]:
+        heldout = set(self.heldout(count))
+        every = range(count) if self.split is None else self.split.training
+        return [index for index in every if index < count and index not in heldout]
 
 
 @dataclass(frozen=True, eq=False)
