@@ -35,7 +35,7 @@ from endotwin.fit.prior import unusual
 from endotwin.fit.sparkle import sparkle
 from endotwin.fit.state import State
 from endotwin.fit.tilt import Tilter
-from endotwin.fit.unexplained import Remains, cast_warning, residual_warning
+from endotwin.fit.unexplained import Remains, odd_photos_warning, residual_warning
 from endotwin.light.film import Film
 from endotwin.light.guides import AT_LENS
 from endotwin.pixels.length_unit import unit_mm
@@ -131,7 +131,7 @@ def _warn(remains: Remains, twin: Twin, decisions: Mapping[str, Decision]) -> No
     """Say where a fit leaves more than it should."""
     if said := residual_warning(remains.sigma, twin.sequence(), decisions):
         logger.warning("%s; 'endotwin check %s' looks for the cause", said, twin.source.path)
-    if said := cast_warning(remains):
+    if said := odd_photos_warning(remains):
         logger.warning("%s", said)
 
 
@@ -287,7 +287,7 @@ class _Fit:
         unit, mesh = unit_mm(surface), surface.triangles
         solver = GaussNewton(samples, mesh, operator, unit, 0, pace.out_of_time, self.device)
         table = torch.zeros(operator.forward_csr.shape[1], 4)
-        state = State(operator, at_vertices, table, coarse.shared, solver.pattern.told)
+        state = without = State(operator, at_vertices, table, coarse.shared, solver.pattern.told)
         step_s = 0.0
         for number in range(pace.plan.steps):
             if pace.left(ITERATIONS) <= step_s / 2:
@@ -303,7 +303,8 @@ class _Fit:
                 break
             normals = tilter.tilted(normals)
             pace.report("tilt the normals", number + 1, pace.plan.tilts)
-        return state, normals, Remains.of(solver.noise(state), *solver.tried(state))
+        remains = Remains.of(solver.noise(state), *solver.tried(state), solver.tried(without)[1])
+        return state, normals, remains
 
     def _finer(self, samples: Samples, cost: Cost) -> tuple[HashOperator, Samples] | None:
         """Features as fine as the mesh, since finer ones would say nothing that a vertex can hold, and the
