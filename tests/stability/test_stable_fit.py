@@ -52,7 +52,8 @@ def test_few_pixels_drawn_with_other_seeds_agree_within_three_tenths_of_a_decibe
     """The bundled example at half its size; half of its pixels are looked at, an eighth for the light."""
     half = fused(0.5)
     few = FitConfig(pixels=200_000)
-    findings = list(spread([endotwin.fit_twin(half, seed=seed, config=few) for seed in range(2)], 0.3, 3))
+    fits = [endotwin.fit_twin(half, seed=seed, config=few, align="off") for seed in range(2)]
+    findings = list(spread(fits, 0.3, 3))
     assert all(finding.ok for finding in findings), findings
 
 
