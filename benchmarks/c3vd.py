@@ -143,7 +143,8 @@ def score(folder: Path, options: tuple[str, ...], work: Path) -> dict:
         return {**row, "note": f"eval: {done.stderr.strip().splitlines()[-1]}"}
     scores = json.loads(done.stdout)
     if scores["lpips"] is not None:
-        row["lpips_vgg"] = json.loads(endotwin("eval", twin, "--json", "--lpips", "vgg").stdout)["lpips"]
+        vgg = endotwin("eval", twin, "--json", "--lpips", "vgg")
+        row["lpips_vgg"] = None if vgg.returncode else json.loads(vgg.stdout)["lpips"]
     record = json.loads((twin / "twin.json").read_text(encoding="utf-8"))["record"]["fuse"]
     row |= {"fused": len(record["fused"]), **{name: scores[name] for _, name, _ in SCORES if name in scores}}
     with whole_file(kept) as file:

@@ -44,8 +44,13 @@ def evaluate(
         ),
     ] = False,
     lpips: Annotated[
-        str, typer.Option(metavar="alex|vgg", help="The network that LPIPS is of: AlexNet or VGG-16.")
-    ] = "alex",
+        str | None,
+        typer.Option(
+            metavar="alex|vgg",
+            help="The network that LPIPS is of: AlexNet or VGG-16.",
+            show_default="alex, where the extra 'lpips' is installed",
+        ),
+    ] = None,
     json: Annotated[
         bool, typer.Option("--json", help="Print the scores as JSON instead of a table.")
     ] = False,

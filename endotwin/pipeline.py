@@ -6,6 +6,7 @@ import logging
 import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, replace
+from numbers import Integral
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -171,6 +172,7 @@ def fit_twin(
     for name, value in (("budget", budget_s), ("number of epochs", epochs)):
         if value is not None:
             _check_positive(name, value)
+    _check_seed(seed)
     twin = _as_recorded(twin)
     config = replace(config, method=method or config.method, budget=budget_s or config.budget)
     undecided = "align" not in twin.record and config.method == "twin" and config.budget is None
@@ -363,7 +365,8 @@ def _job(
     twin = as_twin(twin)
     lens = read_camera(Path(camera)) if camera else twin.camera
     twin = synth.equipped(twin, effects or {}, trajectory)
-    material, light = ([edits] if isinstance(edits, str) else edits for edits in (material, light))
+    _check_seed(seed)
+    material, light = _texts("material", material), _texts("light", light)
     edits = [synth.parse_material_edit(edit) for edit in material]
     variation = synth.fixed(edits, [synth.parse_light_edit(edit) for edit in light])
     if vary:
@@ -371,8 +374,7 @@ def _job(
     grows, wet = bool(polyps or twin.polyps), bool(fluids or twin.fluids)
     chosen = (*synth.DEFAULT_LABELS, *(("polyp",) if grows else ()), *(("fluid",) if wet else ()))
     if labels is not None:
-        labels = labels if isinstance(labels, str) else ",".join(labels)
-        chosen = synth.parse_labels(labels, bool(motion), grows, wet)
+        chosen = synth.parse_labels(",".join(_texts("labels", labels)), bool(motion), grows, wet)
     poses = synth.parse_trajectory(trajectory, twin, seed, lens, limits)
     expected(len(poses) * lens.width * lens.height)
     for added, specs in ((synth.with_polyps, polyps), (synth.with_fluids, fluids)):
@@ -383,6 +385,21 @@ def _job(
     if moving:
         poses = moving.carried(poses)
     return synth.make_job(twin, poses, seed, chosen, layout, lens, variation, moving)
+
+
+def _check_seed(seed: int) -> None:
+    if not isinstance(seed, Integral) or seed < 0:
+        raise OptionError(f"the seed is {seed!r}, but must be a whole number, 0 or more")
+
+
+def _texts(name: str, given: Iterable[str] | str) -> list[str]:
+    try:
+        each = [given] if isinstance(given, str) else list(given)
+    except TypeError:
+        each = [given]
+    if not all(isinstance(text, str) for text in each):
+        raise OptionError(f"{name} is {given!r}, but must be a text or a list of texts")
+    return each
 
 
 def _check_positive(name: str, value: float) -> None:

@@ -305,7 +305,7 @@ DAMAGES: dict[str, Damage] = {
     "photos mirrored": Damage(_photos_mirrored, ("photos_mirrored",)),
     "depth mirrored": Damage(_depth_mirrored, ("depth_mirrored",)),
     "photos and depth mirrored": Damage(_images_mirrored, ("images_mirrored", "poses_left_handed")),
-    "photos + 0.5 px": Damage(photos_moved(0.5, 0.5), ("photos_offset",)),
+    "photos + 0.7 px": Damage(photos_moved(0.7, 0.7), ("photos_offset",)),
     "photos + 6, − 4 px": Damage(photos_moved(6, -4), ("photos_offset",)),
     "one photo repeated": Damage(_photo_repeated, ("duplicate",)),
     "one frame repeated": Damage(_frame_repeated, ("duplicate",)),

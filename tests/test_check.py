@@ -79,6 +79,7 @@ def test_a_planted_mistake_is_named(example, tmp_path, name):
 def test_single_frames_are_named(example, tmp_path):
     copy = Copy(example)
     copy.colors[5] = copy.colors[4]
+    copy.photo[7] = lambda photo: 0 * photo
     copy.photo[10] = lambda photo: cv2.GaussianBlur(photo, (0, 0), 2)
     copy.T[15, :3, 3] += 0.3
     copy.T[[19, 20]] = copy.T[[20, 19]]
@@ -88,10 +89,20 @@ def test_single_frames_are_named(example, tmp_path):
         frames.setdefault(finding.kind, set()).update(finding.frames)
     assert frames == {
         "duplicate": {"0005_color.png"},
+        "blank": {"0007_color.png"},
         "blurred": {"0010_color.png"},
         "misregistered": {"0015_color.png"},
         "mistimed": {"0019_color.png", "0020_color.png"},
     }
+
+
+def test_frames_of_tissue_that_moves_are_not_held_against_one_another(example, tmp_path):
+    folder = damaged(example, tmp_path / "copy", "poses transposed")
+    assert check(folder).findings
+    (folder / "dataset.json").write_text('{"motion": {"peristalsis": {}}}')
+    report = check(folder)
+    assert not {"disagreement", "principal_point", "photos_offset"} & {each.kind for each in report.findings}
+    assert "moves by itself" in report.notes[0]
 
 
 def test_half_a_pixel_is_measured_through_depth_noise(example, tmp_path):

@@ -1,6 +1,7 @@
 """``endotwin check`` on the command line: exit codes, table and JSON."""
 
 import json
+import shutil
 
 import pytest
 from command_line import invoke
@@ -25,9 +26,11 @@ def test_exit_code_1_and_what_to_change_where_something_is_wrong(example, tmp_pa
     assert "Transpose" in finding["change"]
 
 
-@pytest.mark.parametrize("name", ["nowhere", "empty"])
-def test_exit_code_2_and_one_line_where_there_is_nothing_to_read(tmp_path, capsys, name):
+@pytest.mark.parametrize("name", ["nowhere", "empty", "without poses"])
+def test_exit_code_2_and_one_line_where_there_is_nothing_to_read(example, tmp_path, capsys, name):
     (tmp_path / "empty").mkdir()
+    shutil.copytree(example, tmp_path / "without poses")
+    (tmp_path / "without poses" / "pose.txt").write_text("")
     assert invoke("check", tmp_path / name) == 2
     error = capsys.readouterr().err
     assert error.startswith("error:") and error.count("\n") == 1 and name in error

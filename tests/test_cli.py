@@ -118,6 +118,8 @@ def test_eval_keeps_the_scores_in_the_twin_and_says_that_lpips_is_missing(
     code, out, _ = endotwin("eval", tmp_path / "twin")
     assert code == 0 and "not installed" in out
     kept = Twin.load(tmp_path / "twin").record["eval"]
+    code, _, err = endotwin("eval", tmp_path / "twin", "--lpips", "vgg")
+    assert code == 2 and "endotwin[lpips]" in err
     assert kept["lpips"] is None and f"{kept['psnr']:.2f} dB" in repr(Twin.load(tmp_path / "twin"))
 
 

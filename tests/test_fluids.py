@@ -208,6 +208,8 @@ def test_a_pool_is_level_and_no_deeper_than_its_hollow(folded):
 def test_a_pool_runs_off_a_tube_that_holds_none(bare):
     with pytest.raises(OptionError, match="run off"):
         with_fluids(bare, f"blood:size=10,pool=true,gy=-1,{on_the_wall(0.8)}", 0)
+    with pytest.raises(OptionError, match="no hollow of what is seen"):
+        with_fluids(bare, "blood:size=10,pool=true,gz=1", 0, trajectory())
 
 
 def test_a_seed_decides_shapes_and_places(bare, several):

@@ -161,6 +161,19 @@ def test_labels_that_are_none_are_refused(twin, tmp_path, labels):
         endotwin.synthesize(twin, [tube_twin.pose(0.5)], tmp_path / "dataset", labels=labels)
 
 
+@pytest.mark.parametrize(
+    "wrong", [{"seed": 1.5}, {"seed": -1}, {"labels": 3}, {"material": 3}, {"light": [1]}]
+)
+def test_arguments_of_another_type_are_refused(twin, tmp_path, wrong):
+    with pytest.raises(OptionError, match=next(iter(wrong))):
+        endotwin.synthesize(twin, [tube_twin.pose(0.5)], tmp_path / "dataset", **wrong)
+
+
+def test_a_view_is_from_one_pose(twin):
+    with pytest.raises(TrajectoryError, match="one pose"):
+        twin.render(np.repeat(tube_twin.pose(0.5)[None], 2, axis=0))
+
+
 def test_a_twin_may_be_named_by_its_folder(made, tmp_path):
     fitted = endotwin.fit_twin(made / "twin", budget_s=1)
     fitted.save(tmp_path / "twin")

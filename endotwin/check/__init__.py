@@ -8,13 +8,14 @@ one to find those that are repeated, blurred, mis-timed or misregistered.
 What can be told, on sequences with and without 1 % of white depth noise: the way poses are written, units
 and ray depth always where the camera moves; scale and focal lengths to 1 %; the principal point to a quarter
 of a pixel where the camera turns or advances enough (the error is estimated, and nothing within four errors
-is reported); photos against depth maps to 0.4 px; a single frame's pose to 0.3 % of its depth. A left-handed
+is reported); photos against depth maps to 0.7 px; a single frame's pose to 0.3 % of its depth. A left-handed
 pose file and mirrored images are the same thing to geometry; so are a factor on translations and its
 inverse on depth, of which the one that gives a depth usual in the colon is named.
 """
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -40,6 +41,7 @@ from endotwin.check.reading import OPENGL, Lens, Reading
 from endotwin.check.search import Candidate, Found, best_reading
 from endotwin.check.views import Views, read_views
 from endotwin.check.warp import disagreement
+from endotwin.run.output import DATASET
 from endotwin.sequence.poses import AXES_OPENGL_OPENCV
 
 __all__ = ["KINDS", "Finding", "Report", "check"]
@@ -75,6 +77,8 @@ def check(path: Path | str, format: str | None = None, progress: Progress | None
     if len(sequence) < 2 or len(views.depth) < 1000:
         note = "There are too few frames, or too little depth, to compare frames with each other."
         return Report(repr(sequence), opening.findings, (note,), ())
+    if (moving := _moving(Path(path))) is not None:
+        return Report(repr(sequence), opening.findings, (moving,), ())
     found, fine = _judged(views, start, opening.calibrated)
     reading = settled(found.reading, fine, sequence.camera)
     final = disagreement(views, reading)
@@ -92,6 +96,21 @@ def check(path: Path | str, format: str | None = None, progress: Progress | None
         tuple(notes),
         _measures(views, found, final.median, fine, photos),
     )
+
+
+def _moving(path: Path) -> str | None:
+    """A note that tissue moves by itself, which a dataset of endotwin's says; None where it does not."""
+    for folder in (path, path.parent):
+        try:
+            motion = json.loads((folder / DATASET).read_text(encoding="utf-8")).get("motion")
+        except (OSError, ValueError, AttributeError):
+            continue
+        if motion:
+            return (
+                "The tissue moves by itself, so that no frame shows the surface of another: poses, "
+                "intrinsics and depth are not judged; '--labels' judges the labels of each frame."
+            )
+    return None
 
 
 def _judged(views: Views, start: Reading, calibrated: tuple[int, int] | None) -> tuple[Found, Estimate]:

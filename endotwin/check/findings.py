@@ -56,6 +56,7 @@ KINDS = {
     "disagreement": "frames disagree under every reading",
     "duplicate": "frames that repeat the one before",
     "static": "frames between which the camera stands still",
+    "blank": "frames whose photos show nothing",
     "blurred": "frames far less sharp than their neighbours",
     "mistimed": "frames whose pose, photo or depth belongs to another frame",
     "misregistered": "frames whose pose, photo or depth fits no neighbour",

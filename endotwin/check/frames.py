@@ -55,7 +55,7 @@ def frame_findings(
         told |= {name for finding in findings for name in finding.frames}
     if judge_photos and len(sequence) > 3:
         findings += _strange_photos(names, steps, match, told)
-    findings += _blurred(names, sharpness)
+    findings += _faulty(names, sharpness)
     return findings, notes
 
 
@@ -182,18 +182,26 @@ def _strange_photos(names: list[str], steps: list[Step], match: np.ndarray, told
     return findings
 
 
-def _blurred(names: list[str], sharpness: np.ndarray) -> list[Finding]:
-    """Frames with far less fine detail than those around them."""
+def _faulty(names: list[str], sharpness: np.ndarray) -> list[Finding]:
+    """Frames whose photos show nothing, or far less fine detail than those around them."""
     if len(sharpness) < 5:
         return []
-    finite = np.where(np.isfinite(sharpness), sharpness, -10.0)
+    blank = ~np.isfinite(sharpness)
+    finite = np.where(blank, -10.0, sharpness)
     drop = median_filter(finite, size=min(15, len(finite) // 2 * 2 - 1), mode="reflect") - finite
     spread = robust_std(drop - np.median(drop))
-    some = [names[index] for index in np.flatnonzero(drop > max(LEAST_BLUR, 8 * spread))]
-    if not some:
-        return []
-    says = f"{_listed(some)}: far less sharp than the frames around (blurred or out of focus)."
-    return [Finding("blurred", says, "Leave these photos out, with their poses.", "photos", tuple(some))]
+    blurred = ~blank & (drop > max(LEAST_BLUR, 8 * spread))
+    findings = []
+    for kind, which, what in (
+        ("blank", blank, "nothing is to be seen in them"),
+        ("blurred", blurred, "far less sharp than the frames around (blurred or out of focus)"),
+    ):
+        if which.any():
+            index = np.flatnonzero(which)
+            some = [names[each] for each in index]
+            change = f"Leave these frames out: 'endotwin fuse --without {','.join(map(str, index))}'."
+            findings.append(Finding(kind, f"{_listed(some)}: {what}.", change, "photos", tuple(some)))
+    return findings
 
 
 def _listed(names: list[str], most: int = 8) -> str:

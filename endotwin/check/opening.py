@@ -89,6 +89,8 @@ def depth_fault(sequence: Sequence) -> Finding | None:
 def _rigid(sequence: Sequence) -> tuple[Sequence, list[Finding]]:
     """Poses made rigid; raises SequenceError where no one mistake explains them."""
     T, files = sequence.T_world_camera, files_of(sequence)
+    if not len(T):
+        raise SequenceError("no poses")
     if _all_rigid(T):
         return sequence, []
     turned, unit_mm = np.eye(4), 1.0

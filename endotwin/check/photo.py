@@ -35,7 +35,8 @@ FLIPS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
 LEAST_CORRELATION, UNRELATED = 0.15, 0.12
 """Below the first nothing is judged; below the second photos show something else. Path-traced colons have .7
 (.5 with 1 % of noise), a painted smooth cylinder .17, photos of other frames .04 to .16."""
-LEAST_OFFSET = 0.4
+LEAST_OFFSET = 0.5
+"""Twice what textures and shadows beside the rims move a whole sequence by, as if all its rims were off."""
 RIM = 0.12  # jump of ln z between neighbouring pixels
 RIM_SEARCH = 8.0  # pixels either side
 DARK, BRIGHT = 12, 235
@@ -74,7 +75,7 @@ class Registration:
     def off_centre(self) -> bool:
         """Whether photos lie beside their depth maps."""
         length = float(np.linalg.norm(self.offset))
-        return length > max(LEAST_OFFSET, 4 * float(np.linalg.norm(self.error)))
+        return length > LEAST_OFFSET + 2 * float(np.linalg.norm(self.error))
 
 
 def registration(sequence: Sequence, frames: np.ndarray) -> Registration:

@@ -343,7 +343,7 @@ def evaluate(
     sequence: Sequence | Path | str | None = None,
     renders: Path | str | None = None,
     halves: bool = False,
-    lpips: str = metrics.LPIPS_NETWORKS[0],
+    lpips: str | None = None,
 ) -> Evaluation:
     """Score a fitted twin, or another method's pictures, on frames that were held out of the fit.
 
@@ -358,13 +358,13 @@ def evaluate(
         renders: folder of pictures of the held-out frames, each named as its photo.
         halves: also fit the pose of each photo to one half of it and score the other, and the reverse: what
             the twin is worth where poses err from photo to photo.
-        lpips: the network that LPIPS is of, ``alex`` or ``vgg``.
+        lpips: the network that LPIPS is of, ``alex`` or ``vgg``; unless given ``alex``, if it is installed.
 
     Raises:
         TwinError: the twin is not fitted, or no held-out frame has a valid pixel.
         SequenceError: the twin's sequence has moved, or a render is missing or of another size.
         OptionError: ``sequence`` is the twin's own, renders have none, their poses are asked for, or
-            ``lpips`` is no network of LPIPS.
+            ``lpips`` is no network of LPIPS, or is not installed.
         OutputError: ``sheet`` exists or cannot be written.
     """
     kept = sequence is None and renders is None and not isinstance(twin, Twin)
@@ -372,10 +372,7 @@ def evaluate(
     twin = None if twin is None and renders is not None else as_twin(twin)
     if halves and renders is not None:
         raise OptionError("pictures of another method have no pose to fit; leave --halves or --renders out")
-    if lpips not in metrics.LPIPS_NETWORKS:
-        raise OptionError(
-            f"lpips {lpips!r} is no network of LPIPS; choose from {', '.join(metrics.LPIPS_NETWORKS)}"
-        )
+    lpips = _network(lpips)
     if sheet is not None:
         check_picture(sheet, overwrite)
     sequence, indices = _to_be_scored(twin, sequence, renders)
@@ -410,6 +407,19 @@ def evaluate(
     if folder is not None:
         keep_scores(evaluation.to_dict(), twin, Path(folder))
     return evaluation
+
+
+def _network(lpips: str | None) -> str:
+    """The network that LPIPS is of; one that is asked for has to be there."""
+    if lpips is None:
+        return metrics.LPIPS_NETWORKS[0]
+    if lpips not in metrics.LPIPS_NETWORKS:
+        raise OptionError(
+            f"lpips {lpips!r} is no network of LPIPS; choose from {', '.join(metrics.LPIPS_NETWORKS)}"
+        )
+    if not metrics.lpips_installed(lpips):
+        raise OptionError(f"LPIPS of {lpips} cannot be computed: run pip install 'endotwin[lpips]'")
+    return lpips
 
 
 def _to_be_scored(

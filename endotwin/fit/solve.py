@@ -97,7 +97,8 @@ def fit_twin(
         pixels = _Pixels.of(samples, twin, pace, seed)
         start = closed_form(samples[pixels.start], surface.triangles, len(surface.vertices_mm))
     if start.undetermined:
-        logger.warning("the photos cannot tell %s: kept at the prior", " and ".join(start.undetermined))
+        asked = "what there was time to look at of the photos" if pace.hurried else "the photos"
+        logger.warning("%s cannot tell %s: kept at the prior", asked, " and ".join(start.undetermined))
     fit = _Fit(twin, caster.threaded(THREADS), pace, states, device)
     lighted = fit.light(pixels, start)
     relighting = lighted.relighting

@@ -19,7 +19,7 @@ from endotwin.light.incidence import to_camera
 from endotwin.render.illumination import Illumination, ViewLight
 from endotwin.render.sparkles import rough_mm2, sparkles
 from endotwin.run.threads import THREADS
-from endotwin.sequence.poses import as_poses
+from endotwin.sequence.poses import as_pose
 from endotwin.surface.casting import Caster, Correspondences
 from endotwin.surface.silhouettes import discontinuities
 from endotwin.surface.vectors import dot, turned_along
@@ -187,7 +187,7 @@ class Renderer:
         Raises:
             TrajectoryError: that is no rigid pose. OptionError: the mask has another shape than the image.
         """
-        (T_world_camera,) = as_poses(T_world_camera)
+        T_world_camera = as_pose(T_world_camera)
         shape = (self.camera.height, self.camera.width)
         if mask is not None and np.shape(mask) != shape:
             raise OptionError(f"the mask has the shape {np.shape(mask)}, but the image {shape}")

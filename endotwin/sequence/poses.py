@@ -120,6 +120,14 @@ def as_poses(given: object) -> np.ndarray:
         raise TrajectoryError(str(error)) from error
 
 
+def as_pose(given: object) -> np.ndarray:
+    """One pose float64 [4, 4], as ``as_poses`` reads it; raises TrajectoryError for several, too."""
+    poses = as_poses(given)
+    if len(poses) > 1:
+        raise TrajectoryError(f"one pose [4, 4] is asked for, and not {len(poses)}: give one after the other")
+    return poses[0]
+
+
 def from_quaternions(
     positions_mm: np.ndarray, quaternions: np.ndarray, where: Callable[[int], str]
 ) -> np.ndarray:

@@ -182,7 +182,7 @@ class Sequence:
         color = read_color(self.color_files[index])
         if color.shape[1::-1] != self.image_size:
             expected = f"{self.image_size[0]}×{self.image_size[1]}"
-            fault = f"the camera is {expected}; add a camera.json of these images"
+            fault = f"the camera is {expected}; write size and intrinsics of these images to camera.json"
             if index > 0:
                 fault = f"the photos before it are {expected}; give it that size, or remove the frame"
             raise SequenceError(f"{self.color_files[index]} is {_size(color)}, but {fault}")

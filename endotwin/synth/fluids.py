@@ -138,6 +138,8 @@ def _spill(
     found = FLUIDS[kind]
     shape = int(generator.integers(2**63))
     fault, tried = "no such wall is seen", 0
+    if options.pool and not options.placed:
+        fault = "no hollow of what is seen holds any; let gravity pull another way (gx, gy, gz)"
     for point in _places(wall, wetted.twin, f"fluid {spec!r}", options, down, generator):
         puddle = Puddle(
             kind,
@@ -152,7 +154,7 @@ def _spill(
         fault, tried = wetted.add(puddle), tried + 1
         if not fault:
             return
-    where = "there" if options.placed else f"at any of {tried} places"
+    where = "there" if options.placed else f"at any of {tried} places" if tried else "anywhere"
     raise OptionError(f"fluid {spec!r} cannot lie {where}: {fault}; choose another place, or a smaller size")
 
 
