@@ -78,6 +78,13 @@ def test_the_margin_is_what_twice_the_error_of_registration_displaces_by():
     assert moved_px <= margin_px(PINHOLE, RADIUS_MM) < moved_px + 2
 
 
+@pytest.mark.parametrize("median_mm", [1.0, 0.02, 1e-9])
+def test_beside_tissue_nearer_than_errors_of_registration_the_wall_goes_on_by_a_sixteenth_of_the_picture(
+    median_mm,
+):
+    assert margin_px(PINHOLE, median_mm) == PINHOLE.height // 16
+
+
 @pytest.mark.parametrize("share", [1.0, 1.5], ids=["at it", "behind it"])
 def test_nothing_goes_on_where_another_picture_shows_tissue_at_that_place_or_behind_it(share):
     aside = measured(PINHOLE, pose(20))

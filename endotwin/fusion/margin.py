@@ -28,6 +28,10 @@ ERROR_MM, ERROR_DEG = 0.32, 0.16
 ERRORS = 2.0
 """The surface goes on so many errors far."""
 
+MOST = 1 / 16
+"""Of the picture's smaller side: where tissue is so near that errors reach farther, as where depth is in
+another unit, what lies there is anyone's guess."""
+
 FIT_PX = 8
 """The slope with which distance goes on is that of so many pixels."""
 
@@ -83,7 +87,8 @@ def with_margin(
 def margin_px(camera: Camera, median_mm: float) -> int:
     """How far the surface goes on beside pictures of tissue at ``median_mm``, in pixels."""
     pixel = float(np.nanmedian(np.linalg.norm(np.diff(camera.pixel_directions, axis=1), axis=-1)))
-    return int(np.ceil(ERRORS * (ERROR_MM / median_mm + np.radians(ERROR_DEG)) / pixel))
+    by = np.ceil(ERRORS * (ERROR_MM / median_mm + np.radians(ERROR_DEG)) / pixel)
+    return int(min(by, np.ceil(MOST * min(camera.width, camera.height))))
 
 
 def _continued(view: View, by: int) -> View:
