@@ -92,6 +92,7 @@ def fuse_twin(
         raise SequenceError(f"{path} has no frame to fit: every one is held out or left out; use more frames")
     heldout = source.heldout(len(sequence)) if geometry == "known" else []
     frames = sorted({*training, *heldout})
+    sequence.check_sizes(frames)
 
     def report(stage: str, done: int, total: int) -> None:
         stopwatch.lap(stage)

@@ -53,6 +53,15 @@ def read_plane(path: Path) -> np.ndarray:
     return plane if plane.ndim == 2 else np.ascontiguousarray(plane[..., 0])
 
 
+def written_size(path: Path) -> tuple[int, int] | None:
+    """Width and height of an image as its header says; None where that cannot be read."""
+    try:
+        with Image.open(path) as photo:
+            return photo.size
+    except (OSError, ValueError, TypeError, SyntaxError, Image.DecompressionBombError):
+        return None
+
+
 def orientation(path: Path) -> int:
     """How a photo's EXIF says that it is to be turned, 1 to 8; 1, not at all, where it says nothing."""
     try:

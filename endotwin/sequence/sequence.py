@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -13,7 +13,7 @@ import numpy as np
 
 from endotwin.cameras.base import Camera
 from endotwin.errors import SequenceError
-from endotwin.sequence.images import orientation, read_color
+from endotwin.sequence.images import orientation, read_color, written_size
 from endotwin.sequence.spread import spread
 
 SURROUND_FRAMES = 8
@@ -180,13 +180,25 @@ class Sequence:
 
     def _native_color(self, index: int) -> np.ndarray:
         color = read_color(self.color_files[index])
-        if color.shape[1::-1] != self.image_size:
+        self._require_size(index, color.shape[1::-1])
+        return color
+
+    def check_sizes(self, frames: Iterable[int]) -> None:
+        """Raise SequenceError for the first of ``frames`` whose photo is of another size, or is no image, by
+        its header alone."""
+        for index in frames:
+            if (size := written_size(self.color_files[index])) is None:
+                self._native_color(index)  # says what is wrong
+            else:
+                self._require_size(index, size)
+
+    def _require_size(self, index: int, size: tuple[int, int]) -> None:
+        if size != self.image_size:
             expected = f"{self.image_size[0]}×{self.image_size[1]}"
             fault = f"the camera is {expected}; write size and intrinsics of these images to camera.json"
             if index > 0:
                 fault = f"the photos before it are {expected}; give it that size, or remove the frame"
-            raise SequenceError(f"{self.color_files[index]} is {_size(color)}, but {fault}")
-        return color
+            raise SequenceError(f"{self.color_files[index]} is {size[0]}×{size[1]}, but {fault}")
 
     def _resized_color(self, color: np.ndarray) -> np.ndarray:
         if self.scale == 1:
