@@ -10,13 +10,13 @@ those that `fit` tells to leave out, of those that were spoilt and of all others
 import argparse
 import logging
 import re
+import shutil
 import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import cv2
 import numpy as np
-from perturbed import Error, spoilt
 
 import endotwin
 
@@ -90,14 +90,14 @@ class Named(logging.Handler):
 
 def rows(options: argparse.Namespace) -> Iterator[list[str]]:
     """The table, a row a fault."""
-    sequence, clean_db = endotwin.open_sequence(options.sequence, scale=options.scale), 0.0
+    sequence, clean_db = endotwin.open_sequence(options.sequence), 0.0
     for name, fault in FAULTS.items():
         with tempfile.TemporaryDirectory() as work:
-            folder = spoilt(sequence, Error(), Path(work) / "faulty", 0)
-            twin = endotwin.fuse_twin(folder)
+            folder = Path(shutil.copytree(sequence.path, Path(work) / "faulty"))
+            twin = endotwin.fuse_twin(folder, scale=options.scale)
             faulty = twin.source.training(len(sequence))[EVERY // 2 :: EVERY] if name != "none" else []
             for index in faulty:
-                file = str(folder / f"{index:04d}_color.png")
+                file = str(folder / sequence.color_files[index].relative_to(sequence.path))
                 photo = fault(cv2.imread(file), np.random.default_rng([options.seed, index]))
                 cv2.imwrite(file, np.rint(np.clip(photo, 0, 255)).astype(np.uint8))
             named = Named()
@@ -108,7 +108,8 @@ def rows(options: argparse.Namespace) -> Iterator[list[str]]:
             clean_db = clean_db or scores.psnr_covered
             left = scores
             if faulty:
-                left = endotwin.evaluate(endotwin.fit_twin(endotwin.fuse_twin(folder, without=faulty)))
+                fused = endotwin.fuse_twin(folder, scale=options.scale, without=faulty)
+                left = endotwin.evaluate(endotwin.fit_twin(fused))
         yield [
             name,
             f"{scores.psnr_covered:.2f} dB",
@@ -125,7 +126,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("sequence", type=Path)
+    parser.add_argument("sequence", type=Path, help="a folder")
     parser.add_argument("--scale", type=float, default=1.0, help="factor on the image size")
     parser.add_argument("--seed", type=int, default=0)
     titles = ["fault", "covered", "lost", "γ", "n", "named", "left out: covered", "γ"]
