@@ -22,6 +22,7 @@ from endotwin.twin import Source, Twin, as_twin
 if TYPE_CHECKING:
     import numpy as np
 
+    from endotwin.sequence import Sequence
     from endotwin.synth import Job, Limits, Summary
 
 GEOMETRIES = ("known", "heldout")
@@ -79,12 +80,8 @@ def fuse_twin(
         split=sequence.split,
         undistort=undistort,
     )
-    if left_out := sorted(without):
-        for index in (left_out[0], left_out[-1]):
-            if not 0 <= index < len(sequence):
-                raise OptionError(
-                    f"{path} has no frame {index} to leave out: its frames are 0 to {len(sequence) - 1}"
-                )
+    if left_out := list(without):
+        _check_frames(left_out, sequence)
         source = source.without(left_out, len(sequence))
         sequence = source.limited(sequence)
     training = source.training(len(sequence))
@@ -386,6 +383,14 @@ def _job(
     if moving:
         poses = moving.carried(poses)
     return synth.make_job(twin, poses, seed, chosen, layout, lens, variation, moving)
+
+
+def _check_frames(left_out: list[int], sequence: Sequence) -> None:
+    for index in left_out:
+        if not isinstance(index, Integral) or not 0 <= index < len(sequence):
+            raise OptionError(
+                f"{sequence.path} has no frame {index} to leave out: its frames are 0 to {len(sequence) - 1}"
+            )
 
 
 def _check_seed(seed: int) -> None:

@@ -69,6 +69,8 @@ def test_frames_that_are_left_out_are_not_even_read_and_the_others_keep_their_pa
     assert [frame.index for frame in endotwin.evaluate(twin).frames] == [0]
     with pytest.raises(endotwin.EndotwinError, match="no frame 9 to leave out: its frames are 0 to 8"):
         endotwin.fuse_twin(folder, without=[9])
+    with pytest.raises(endotwin.EndotwinError, match="no frame 3 to leave out"):
+        endotwin.fuse_twin(folder, without="3")
     with pytest.raises(endotwin.EndotwinError, match="no frame to fit"):
         endotwin.fuse_twin(folder, without=range(1, 8))
 

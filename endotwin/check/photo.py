@@ -36,7 +36,7 @@ LEAST_CORRELATION, UNRELATED = 0.15, 0.12
 """Below the first nothing is judged; below the second photos show something else. Path-traced colons have .7
 (.5 with 1 % of noise), a painted smooth cylinder .17, photos of other frames .04 to .16."""
 LEAST_OFFSET = 0.5
-"""Twice what textures and shadows beside the rims move a whole sequence by, as if all its rims were off."""
+"""Twice the quarter of a pixel by which textures and shadows beside the rims move a whole sequence."""
 RIM = 0.12  # jump of ln z between neighbouring pixels
 RIM_SEARCH = 8.0  # pixels either side
 DARK, BRIGHT = 12, 235

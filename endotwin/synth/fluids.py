@@ -139,7 +139,7 @@ def _spill(
     shape = int(generator.integers(2**63))
     fault, tried = "no such wall is seen", 0
     if options.pool and not options.placed:
-        fault = "no hollow of what is seen holds any; let gravity pull another way (gx, gy, gz)"
+        fault = "no hollow of what is seen holds any as gravity pulls (gx, gy and gz say which way)"
     for point in _places(wall, wetted.twin, f"fluid {spec!r}", options, down, generator):
         puddle = Puddle(
             kind,
