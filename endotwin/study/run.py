@@ -54,6 +54,10 @@ SUPERSAMPLING = 2
 logger = logging.getLogger("endotwin")
 
 
+MOST = 1_000_000
+"""Of frames, seeds and steps, each."""
+
+
 @dataclass(frozen=True)
 class Plan:
     """What is asked.
@@ -75,11 +79,10 @@ class Plan:
     device: str = "cpu"
 
     def __post_init__(self) -> None:
-        for name in ("frames", "seeds"):
-            if getattr(self, name) < 1:
-                raise OptionError(f"the number of {name} is {getattr(self, name)}, but must be at least 1")
-        if self.steps is not None and self.steps < 1:
-            raise OptionError(f"the number of steps is {self.steps}, but must be at least 1")
+        for name in ("frames", "seeds", "steps"):
+            number = getattr(self, name)
+            if number is not None and not 1 <= number <= MOST:
+                raise OptionError(f"the number of {name} is {number}, but must lie between 1 and {MOST:,}")
         if self.loss not in LOSSES:
             raise OptionError(f"there is no loss {self.loss!r}; choose one of {', '.join(LOSSES)}")
 
