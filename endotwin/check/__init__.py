@@ -15,7 +15,6 @@ inverse on depth, of which the one that gives a depth usual in the colon is name
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -41,6 +40,7 @@ from endotwin.check.reading import OPENGL, Lens, Reading
 from endotwin.check.search import Candidate, Found, best_reading
 from endotwin.check.views import Views, read_views
 from endotwin.check.warp import disagreement
+from endotwin.run.jsontext import parsed
 from endotwin.run.output import DATASET
 from endotwin.sequence.poses import AXES_OPENGL_OPENCV
 
@@ -102,7 +102,7 @@ def _moving(path: Path) -> str | None:
     """A note that tissue moves by itself, which a dataset of endotwin's says; None where it does not."""
     for folder in (path, path.parent):
         try:
-            motion = json.loads((folder / DATASET).read_text(encoding="utf-8")).get("motion")
+            motion = parsed((folder / DATASET).read_text(encoding="utf-8")).get("motion")
         except (OSError, ValueError, AttributeError):
             continue
         if motion:

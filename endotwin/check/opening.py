@@ -89,8 +89,6 @@ def depth_fault(sequence: Sequence) -> Finding | None:
 def _rigid(sequence: Sequence) -> tuple[Sequence, list[Finding]]:
     """Poses made rigid; raises SequenceError where no one mistake explains them."""
     T, files = sequence.T_world_camera, files_of(sequence)
-    if not len(T):
-        raise SequenceError("no poses")
     if _all_rigid(T):
         return sequence, []
     turned, unit_mm = np.eye(4), 1.0
@@ -170,6 +168,6 @@ def _with_poses(sequence: Sequence, T: np.ndarray) -> Sequence:
 
 def _all_rigid(T: np.ndarray) -> bool:
     gram = T[:, :3, :3].transpose(0, 2, 1) @ T[:, :3, :3]
-    orthonormal = np.abs(gram - np.eye(3)).max() <= RIGID_TOLERANCE
-    last_row = np.abs(T[:, 3] - (0, 0, 0, 1)).max() <= RIGID_TOLERANCE
+    orthonormal = np.abs(gram - np.eye(3)).max(initial=0) <= RIGID_TOLERANCE
+    last_row = np.abs(T[:, 3] - (0, 0, 0, 1)).max(initial=0) <= RIGID_TOLERANCE
     return bool(orthonormal and last_row and (np.linalg.det(T[:, :3, :3]) > 0).all())

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -117,27 +117,27 @@ def _cast(remains: Remains) -> Odd | None:
 def _blurred(remains: Remains) -> Odd | None:
     """Photos that lack detail."""
     share = _beside_others(remains.detail)
-    odd = _beyond(1 - share, 1 - BLURRED)
-    if not len(odd):
-        return None
-    worst = odd[share[odd].argmin()]
-    return (
-        f"photo {remains.frames[worst]} shows {100 * max(share[worst], 0):.0f} % of the detail that the "
-        "others do (is it blurred?)"
-    ), odd
+
+    def says(worst: int) -> str:
+        return (
+            f"photo {remains.frames[worst]} shows {100 * max(share[worst], 0):.0f} % of the detail that the "
+            "others do (is it blurred?)"
+        )
+
+    return _odd(1 - share, 1 - BLURRED, says)
 
 
 def _amiss(remains: Remains) -> Odd | None:
     """Photos that the fit does not explain."""
     times = _beside_others(remains.sigmas)
-    odd = _beyond(times - 1, FAR - 1)
-    if not len(odd):
-        return None
-    worst = odd[times[odd].argmax()]
-    return (
-        f"photo {remains.frames[worst]} departs from the fit {times[worst]:.1f} times as far as the others "
-        "do (is the lens smeared, or its pose another?)"
-    ), odd
+
+    def says(worst: int) -> str:
+        return (
+            f"photo {remains.frames[worst]} departs from the fit {times[worst]:.1f} times as far as the "
+            "others do (is the lens smeared, or its pose another?)"
+        )
+
+    return _odd(times - 1, FAR - 1, says)
 
 
 def _beside_others(values: np.ndarray) -> np.ndarray:
@@ -146,10 +146,10 @@ def _beside_others(values: np.ndarray) -> np.ndarray:
     return values / np.median(known) if known.size else np.full_like(values, np.nan)
 
 
-def _beyond(off: np.ndarray, least: float) -> np.ndarray:
-    """Rows of those ``off`` [F] by more than ``least`` and by more than WIDTHS of all that are known."""
-    known = off[np.isfinite(off)]
-    return np.flatnonzero(off > max(least, WIDTHS * robust_std(known)))
+def _odd(off: np.ndarray, least: float, says: Callable[[int], str]) -> Odd | None:
+    """Photos that are ``off`` [F] by more than ``least`` and by more than WIDTHS of all that are known."""
+    rows = np.flatnonzero(off > max(least, WIDTHS * robust_std(off[np.isfinite(off)])))
+    return (says(rows[off[rows].argmax()]), rows) if len(rows) else None
 
 
 def residual_warning(left: float, sequence: Sequence, decisions: Mapping[str, Decision]) -> str | None:

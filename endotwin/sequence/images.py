@@ -45,6 +45,10 @@ def write_png(path: Path, image: np.ndarray, overwrite: bool = False) -> None:
         beside.write_bytes(content)
 
 
+UNREADABLE = (OSError, ValueError, TypeError, SyntaxError, Image.DecompressionBombError)
+"""What Pillow raises for files whose header it cannot read."""
+
+
 def read_plane(path: Path) -> np.ndarray:
     """A depth file as stored, [H, W]; of several channels, the first. Raises SequenceError where damaged."""
     if path.suffix.lower() in floatdepth.SUFFIXES:
@@ -58,7 +62,7 @@ def written_size(path: Path) -> tuple[int, int] | None:
     try:
         with Image.open(path) as photo:
             return photo.size
-    except (OSError, ValueError, TypeError, SyntaxError, Image.DecompressionBombError):
+    except UNREADABLE:
         return None
 
 
@@ -67,7 +71,7 @@ def orientation(path: Path) -> int:
     try:
         with Image.open(path) as photo:
             return int(photo.getexif().get(EXIF_ORIENTATION, 1))
-    except (OSError, ValueError, TypeError, SyntaxError, Image.DecompressionBombError):
+    except UNREADABLE:
         return 1
 
 

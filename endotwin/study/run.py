@@ -51,11 +51,10 @@ OWN = ("study", "results", "networks", "recipes", "depth")
 SUPERSAMPLING = 2
 """Frames are rendered at so many times the network's width, and each pixel is the mean of what it covers."""
 
-logger = logging.getLogger("endotwin")
-
-
 MOST = 1_000_000
 """Of frames, seeds and steps, each."""
+
+logger = logging.getLogger("endotwin")
 
 
 @dataclass(frozen=True)
