@@ -262,6 +262,10 @@ def _one_pose_off(copy: Copy) -> None:
     copy.T[len(copy) // 2] = copy.T[len(copy) // 2] @ turn
 
 
+def _one_pose_for_all(copy: Copy) -> None:
+    copy.T[:] = copy.T[0]
+
+
 def _poses_swapped(copy: Copy) -> None:
     k = len(copy) // 2
     copy.T[[k, k + 1]] = copy.T[[k + 1, k]]
@@ -310,6 +314,7 @@ DAMAGES: dict[str, Damage] = {
     "one photo repeated": Damage(_photo_repeated, ("duplicate",)),
     "one frame repeated": Damage(_frame_repeated, ("duplicate",)),
     "two photos blurred": Damage(_blurred, ("blurred",)),
+    "one pose for all": Damage(_one_pose_for_all, ("poses_still",)),
     "one pose off": Damage(_one_pose_off, ("misregistered",)),
     "two poses swapped": Damage(_poses_swapped, ("mistimed",)),
     "two photos swapped": Damage(_photos_swapped, ("mistimed",)),

@@ -36,6 +36,7 @@ QUICK = [
     "intrinsics of half size",
     "principal point + 0.5 px",
     "photos one frame late",
+    "one pose for all",
 ]
 OFFSETS = st.floats(-2, 2)
 
@@ -68,6 +69,13 @@ def test_what_a_recorder_did_to_the_photos_is_noted(example, tmp_path):
     assert report.consistent and [note.partition(";")[0] for note in report.notes] == [
         "codec: the photos were coded as JPEG pictures of quality 70"
     ]
+
+
+def test_photos_whose_red_and_blue_are_swapped_are_noted(example, tmp_path):
+    copy = Copy(example)
+    copy.every_photo(lambda photo: photo[..., ::-1])
+    report = check(copy.write(tmp_path / "copy"))
+    assert report.consistent and any("red and blue may be swapped" in note for note in report.notes)
 
 
 @pytest.mark.parametrize("name", QUICK)

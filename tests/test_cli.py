@@ -423,8 +423,11 @@ def test_undistorted_frames_are_those_that_a_twin_is_made_of(endotwin, tube, tmp
     assert (document["camera"]["width"], document["camera"]["height"]) == (48, 36)
 
 
-def test_a_photo_of_another_size_or_that_is_none_stops_fuse_before_it_begins(fails, tube, tmp_path):
+def test_a_photo_of_another_size_truncated_or_none_stops_fuse_before_it_begins(fails, tube, tmp_path):
     folder = shutil.copytree(tube, tmp_path / "spoilt")
+    photo = (folder / "0002_color.png").read_bytes()
+    (folder / "0002_color.png").write_bytes(photo[:-20])
+    assert "0002_color.png is truncated" in fails("fuse", folder, "-o", tmp_path / "twin")
     cv2.imwrite(str(folder / "0002_color.png"), np.full((10, 12, 3), 90, np.uint8))
     assert "0002_color.png is 12×10" in fails("fuse", folder, "-o", tmp_path / "twin")
     (folder / "0002_color.png").write_bytes(b"no picture")

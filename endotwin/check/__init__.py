@@ -86,7 +86,8 @@ def check(path: Path | str, format: str | None = None, progress: Progress | None
     photos = registration(sequence, views.frames)
     findings = _findings(opening, reading, fine, views, photos, files)
     if not agrees:
-        findings.append(_disagreement(final.median, final.lands, files))
+        still = (written == written[0]).all()
+        findings.append(_still(files) if still else _disagreement(final.median, final.lands, files))
     in_place = photos.judged and photos.flip == "none" and photos.shift == 0
     frames, notes = frame_findings(sequence, written, reading, files.poses, agrees, in_place, progress)
     notes = [*_limits(views, reading, fine, photos), *notes, *processing(sequence)]
@@ -148,6 +149,11 @@ def _findings(
         *other_findings(reading, photos if photos.judged else None, files),
         *offset_finding(photos),
     ]
+
+
+def _still(files: Files) -> Finding:
+    says = "All poses are the same, while the depth maps show that the camera moves."
+    return Finding("poses_still", says, f"Write the pose of each frame into {files.poses}.", files.poses)
 
 
 def _disagreement(median: float, lands: float, files: Files) -> Finding:

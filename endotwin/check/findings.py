@@ -35,6 +35,7 @@ KINDS = {
     "poses_scaled": "rotations are multiplied by a factor",
     "poses_order": "poses are in another order than the frames",
     "poses_shifted": "poses belong to other frames",
+    "poses_still": "all poses are the same, while depth changes",
     "poses_count": "there are more or fewer poses than frames",
     "pose_unit": "translations are in another unit than depth",
     "depth_unit": "depth is in another unit than translations",

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import struct
 import zlib
-from io import BytesIO
+from io import SEEK_END, BytesIO
 from pathlib import Path
 from threading import Lock
 
@@ -19,6 +19,7 @@ from endotwin.run.output import whole_file
 from endotwin.sequence import floatdepth
 
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+PNG_END = b"IEND\xaeB`\x82"
 JPEG_SIGNATURE, JPEG_END = b"\xff\xd8", b"\xff\xd9"
 TIFF_SIGNATURES = (b"II*\x00", b"MM\x00*", b"II+\x00", b"MM\x00+")
 TIFF_OWN_COMPRESSIONS = (1, 8, 32946)  # none and deflate, which tifffile decodes by itself
@@ -58,12 +59,16 @@ def read_plane(path: Path) -> np.ndarray:
 
 
 def written_size(path: Path) -> tuple[int, int] | None:
-    """Width and height of an image as its header says; None where that cannot be read."""
+    """Width and height of an image as its header says; None where that cannot be read, or no PNG's or JPEG's
+    end shows that the file is whole."""
     try:
-        with Image.open(path) as photo:
-            return photo.size
+        with path.open("rb") as file, Image.open(file) as photo:
+            size = photo.size
+            file.seek(-min(TRAILING_BYTES, path.stat().st_size), SEEK_END)
+            end = file.read()
     except UNREADABLE:
         return None
+    return size if PNG_END in end or JPEG_END in end else None
 
 
 def orientation(path: Path) -> int:

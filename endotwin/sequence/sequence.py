@@ -184,8 +184,8 @@ class Sequence:
         return color
 
     def check_sizes(self, frames: Iterable[int]) -> None:
-        """Raise SequenceError for the first of ``frames`` whose photo is of another size, or is no image, by
-        its header alone."""
+        """Raise SequenceError for the first of ``frames`` whose photo is of another size, truncated, or no
+        image: by its header and its end, unless these leave it open."""
         for index in frames:
             if (size := written_size(self.color_files[index])) is None:
                 self._native_color(index)  # says what is wrong
