@@ -9,6 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import tube_sequence
 from damaged import DAMAGES, Copy
 from hypothesis import given
 from hypothesis import strategies as st
@@ -89,6 +90,7 @@ def test_single_frames_are_named(example, tmp_path):
     copy.colors[5] = copy.colors[4]
     copy.photo[7] = lambda photo: 0 * photo
     copy.photo[10] = lambda photo: cv2.GaussianBlur(photo, (0, 0), 2)
+    copy.depths[2] = copy.depths[1]
     copy.T[15, :3, 3] += 0.3
     copy.T[[19, 20]] = copy.T[[20, 19]]
     copy.write(tmp_path / "copy")
@@ -96,7 +98,7 @@ def test_single_frames_are_named(example, tmp_path):
     for finding in check(tmp_path / "copy").findings:
         frames.setdefault(finding.kind, set()).update(finding.frames)
     assert frames == {
-        "duplicate": {"0005_color.png"},
+        "duplicate": {"0005_color.png", "0002_color.png"},
         "blank": {"0007_color.png"},
         "blurred": {"0010_color.png"},
         "misregistered": {"0015_color.png"},
@@ -113,6 +115,12 @@ def test_frames_of_tissue_that_moves_are_not_held_against_one_another(example, t
     assert "moves by itself" in report.notes[0]
 
 
+@pytest.mark.parametrize(("width", "height"), [(16, 16), (64, 20)])
+def test_pictures_of_a_few_pixels_are_checked_as_far_as_they_tell(tmp_path, width, height):
+    report = check(tube_sequence.write(tmp_path / "tube", 5, width, height))
+    assert report.consistent and report.notes
+
+
 def test_half_a_pixel_is_measured_through_depth_noise(example, tmp_path):
     sequence = open_sequence(damaged(example, tmp_path / "copy", "principal point + 0.5 px", noise=0.01))
     views = read_views(sequence, sequence.T_world_camera)
@@ -124,7 +132,7 @@ def test_half_a_pixel_is_measured_through_depth_noise(example, tmp_path):
 
 def test_matrices_of_a_transforms_json_written_transposed_or_as_opencv_are_named(example, tmp_path):
     sequence = open_sequence(example)
-    T = sequence.T_world_camera
+    T = sequence.T_world_camera[::2]
     opengl = T @ np.diag([1.0, -1.0, -1.0, 1.0])
     for matrices, kind in (
         (opengl, None),
@@ -134,7 +142,9 @@ def test_matrices_of_a_transforms_json_written_transposed_or_as_opencv_are_named
     ):
         frames = [
             {"file_path": str(color), "depth_file_path": str(depth), "transform_matrix": matrix.tolist()}
-            for color, depth, matrix in zip(sequence.color_files, sequence.depth_files, matrices, strict=True)
+            for color, depth, matrix in zip(
+                sequence.color_files[::2], sequence.depth_files[::2], matrices, strict=True
+            )
         ]
         camera = sequence.camera
         content = {
@@ -144,6 +154,18 @@ def test_matrices_of_a_transforms_json_written_transposed_or_as_opencv_are_named
         }
         (tmp_path / "transforms.json").write_text(json.dumps(content))
         assert named(tmp_path / "transforms.json") == ({kind} if kind else set())
+    pair = tmp_path / "pair"
+    pair.mkdir()
+    for name, chosen in (("train", frames[1:]), ("test", frames[:1])):
+        turned = [
+            {**frame, "transform_matrix": np.transpose(matrix).tolist()}
+            for frame, matrix in zip(chosen, opengl[1:] if name == "train" else opengl[:1], strict=True)
+        ]
+        (pair / f"transforms_{name}.json").write_text(json.dumps({**content, "frames": turned}))
+    (finding,) = check(pair).findings
+    assert (
+        finding.kind == "poses_transposed" and "transforms_train.json and transforms_test" in finding.change
+    )
 
 
 def test_what_no_reading_mends_keeps_the_readers_own_sentence(example, tmp_path):

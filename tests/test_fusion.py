@@ -11,6 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial import Delaunay
 
+from endotwin import fusion
 from endotwin.cameras import CALIBRATIONS
 from endotwin.errors import OptionError, SequenceError
 from endotwin.fusion import fuse
@@ -159,7 +160,7 @@ def test_carve_removes_a_planted_membrane_and_patch_fills_a_planted_hole(tube, f
     assert disagreement(tube, damaged) > disagreement(tube, fused_tube) + 0.05
     frames = range(len(tube))
     for _ in range(2):
-        damaged, _ = reconciled(tube.camera, damaged, read_views(tube, frames), TOLERANCE, VOXEL_MM)
+        damaged, _ = reconciled(tube.camera, damaged, read_views(tube, frames), TOLERANCE)
     assert disagreement(tube, damaged) < disagreement(tube, fused_tube) + 1e-3
     inner = np.hypot(*(damaged.vertices_mm + damaged.origin_mm)[:, :2].T) < 6
     near_end = np.abs((damaged.vertices_mm + damaged.origin_mm)[:, 2]) > 40
@@ -177,7 +178,7 @@ def torn_tube(fused_tube):
 @pytest.fixture(scope="module")
 def patched_tube(tube, torn_tube):
     views = read_views(tube, range(len(tube)))
-    return reconciled(tube.camera, torn_tube, views, TOLERANCE, VOXEL_MM)[0]
+    return reconciled(tube.camera, torn_tube, views, TOLERANCE)[0]
 
 
 def test_a_patch_does_not_lie_twice(tube, fused_tube, torn_tube, patched_tube):
@@ -187,7 +188,7 @@ def test_a_patch_does_not_lie_twice(tube, fused_tube, torn_tube, patched_tube):
 
     removed = area_mm2(fused_tube) - area_mm2(torn_tube)
     views = read_views(tube, range(len(tube)))
-    undamaged, _ = reconciled(tube.camera, fused_tube, views, TOLERANCE, VOXEL_MM)
+    undamaged, _ = reconciled(tube.camera, fused_tube, views, TOLERANCE)
     patched_mm2 = area_mm2(patched_tube) - area_mm2(undamaged) + removed
     assert patched_mm2 == pytest.approx(removed, rel=0.05)
 
@@ -279,7 +280,7 @@ def test_noise_in_depth_does_not_tear_the_mesh(tube, fused_tube):
     assert len(surface.vertices_mm) < 1.5 * len(fused_tube.vertices_mm)
 
 
-def test_a_frame_without_depth_is_skipped_and_named(tube, caplog):
+def test_a_frame_without_depth_is_skipped_and_named(tube, caplog, monkeypatch):
     def second_is_blank(path):
         depth_mm = np.load(path)
         return np.full_like(depth_mm, np.nan) if Path(path).stem == "0001" else depth_mm
@@ -288,6 +289,13 @@ def test_a_frame_without_depth_is_skipped_and_named(tube, caplog):
         fuse(replace(tube, read_depth_mm=second_is_blank), frames=[0, 1], voxel_mm=1.0)
     assert [record for record in caplog.records if "0001.npy" in record.getMessage()]
     assert len(caplog.records) == 1
+    caplog.clear()
+    monkeypatch.setattr(fusion, "WORTH_PIXELS", 0)
+    record = {}
+    with caplog.at_level(logging.WARNING, "endotwin"):
+        fuse(replace(tube, read_depth_mm=second_is_blank), frames=[0, 1], voxel_mm=1.0, record=record)
+    assert ["0001.npy" in each.getMessage() for each in caplog.records] == [True]
+    assert record == {"fused": [0], "nothing_new": 0}
 
 
 def test_no_valid_depth_at_all_is_one_sentence(tube):
@@ -298,7 +306,12 @@ def test_no_valid_depth_at_all_is_one_sentence(tube):
 
 
 @pytest.mark.parametrize(
-    "options", [{"voxel_mm": 0.0}, {"voxel_mm": -1.0}, {"voxel_mm": np.nan}, {"frames": []}]
+    "options",
+    [
+        *({"voxel_mm": value} for value in (0.0, -1.0, np.nan)),
+        *({"voxel": value} for value in (0.0, 1e-3)),
+        {"frames": []},
+    ],
 )
 def test_senseless_options_are_refused(tube, options):
     with pytest.raises(OptionError):

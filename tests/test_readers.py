@@ -8,7 +8,7 @@ import struct
 import subprocess
 import sys
 import zlib
-from dataclasses import asdict
+from dataclasses import asdict, replace
 
 import cv2
 import numpy as np
@@ -24,6 +24,7 @@ from endotwin.errors import CameraError, OptionError, SequenceError, TrajectoryE
 from endotwin.sequence.images import PNG_SIGNATURE
 from endotwin.sequence.poses import read_poses, write_c3vd_poses
 from endotwin.sequence.readers import FORMATS, open_sequence
+from endotwin.sequence.readers.transforms import write_poses
 from endotwin.sequence.sequence import Split
 from endotwin.twin import Source
 
@@ -137,6 +138,15 @@ def test_transforms_in_millimetres_scale_positions_and_depth_alike(tmp_path):
     np.testing.assert_allclose(sequence.depth_mm(0), 12.5)
 
 
+def test_the_scale_that_nerfstudio_applied_to_positions_is_taken_back(tmp_path):
+    poses = truth_poses(3)
+    sequence = open_sequence(write_transforms(tmp_path, poses, unit_mm=4000.0, applied_scale=0.25))
+    np.testing.assert_allclose(sequence.T_world_camera, poses, atol=1e-9)
+    np.testing.assert_allclose(sequence.depth_mm(1), 26, rtol=1e-6)
+    write_poses(tmp_path / "again.json", sequence)
+    np.testing.assert_allclose(read_poses(tmp_path / "again.json")[0], poses, atol=1e-9)
+
+
 @pytest.mark.parametrize(
     ("lists", "training", "heldout"),
     [
@@ -184,6 +194,10 @@ def test_training_and_test_files_are_one_sequence_with_that_split(tmp_path):
     assert sequence.split == Split((1, 2, 3, 5, 6, 7, 9, 10, 11), (0, 4, 8))
     np.testing.assert_allclose(sequence.T_world_camera, poses, atol=1e-9)
     np.testing.assert_allclose(sequence.depth_mm(8), 33, rtol=1e-6)
+    write_poses(folder / "moved.json", replace(sequence, T_world_camera=poses @ np.diag([-1.0, -1, 1, 1])))
+    moved = open_sequence(folder / "moved.json")
+    assert moved.split == sequence.split
+    np.testing.assert_allclose(moved.T_world_camera, poses @ np.diag([-1.0, -1, 1, 1]), atol=1e-9)
     (folder / "transforms_test.json").write_text(json.dumps({**content, "fl_x": 50.0, "frames": frames[:1]}))
     with pytest.raises(CameraError, match="another camera"):
         open_sequence(folder)
@@ -248,6 +262,8 @@ def test_named_floating_point_depth_is_read(tmp_path):
         ({"fl_x": -1}, "'fx'"),
         ({"k4": 0.1}, "'k4'"),
         ({"cx": "middle"}, "'cx'"),
+        ({"fl_x": None, "camera_angle_x": 0}, "neither 'fl_x' nor 'camera_angle_x'"),
+        ({"camera_model": "OPENCV", "is_fisheye": True}, "'is_fisheye' and 'OPENCV'"),
     ],
 )
 def test_a_transforms_camera_that_cannot_be_used_is_refused(tmp_path, top, told):
@@ -257,7 +273,11 @@ def test_a_transforms_camera_that_cannot_be_used_is_refused(tmp_path, top, told)
 
 @pytest.mark.parametrize(
     ("top", "told"),
-    [({"unit": "inch"}, "'inch'"), ({"depth_unit_scale_factor": 0}, "'depth_unit_scale_factor'")],
+    [
+        ({"unit": "inch"}, "'inch'"),
+        ({"applied_scale": "2"}, "'applied_scale'"),
+        ({"depth_unit_scale_factor": 0}, "'depth_unit_scale_factor'"),
+    ],
 )
 def test_a_transforms_unit_that_makes_no_sense_is_refused(tmp_path, top, told):
     with pytest.raises(SequenceError, match=told):

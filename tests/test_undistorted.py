@@ -55,6 +55,9 @@ def test_a_twin_of_undistorted_frames_opens_them_so_again(distorted, tmp_path):
     again = endotwin.Twin.load(tmp_path / "twin")
     assert again.sequence().camera == twin.camera
     np.testing.assert_array_equal(again.sequence().color(2), twin.sequence().color(2))
+    half, halved = twin.source.shrunk(0.5).open().camera, twin.camera.scaled(0.5)
+    np.testing.assert_allclose(half.matrix, halved.matrix, atol=0.3)
+    assert (half.width, half.height) == (80, 60)
 
 
 def test_a_size_that_enlarges_or_a_scale_beside_it_is_refused(distorted):

@@ -6,9 +6,8 @@ from pathlib import Path
 
 from endotwin.run.output import whole_file
 from endotwin.sequence import Sequence
-from endotwin.sequence.poses import write_c3vd_poses, write_transforms_poses, write_tum_poses
-
-TRANSFORMS = "transforms.json"
+from endotwin.sequence.poses import write_c3vd_poses, write_tum_poses
+from endotwin.sequence.readers import transforms
 
 
 def write_poses(path: Path, sequence: Sequence, overwrite: bool = False) -> None:
@@ -22,7 +21,6 @@ def write_poses(path: Path, sequence: Sequence, overwrite: bool = False) -> None
         if sequence.format == "c3vd":
             write_c3vd_poses(file, sequence.T_world_camera)
         elif sequence.format == "transforms":
-            source = sequence.path if sequence.path.is_file() else sequence.path / TRANSFORMS
-            write_transforms_poses(file, sequence.T_world_camera, source)
+            transforms.write_poses(file, sequence)
         else:
             write_tum_poses(file, sequence.T_world_camera, sequence.timestamps_s)

@@ -179,7 +179,9 @@ def _limits(views: Views, reading: Reading, fine: Estimate, photos: Registration
         notes.append(
             f"Half a pixel of the principal point cannot be told here (±{fine.error[3:5].max():.1f} px)."
         )
-    if not photos.judged and not photos.unrelated:
+    if np.isnan(photos.best):
+        notes.append("The pictures are too small for photos to be held against depth maps.")
+    elif not photos.judged and not photos.unrelated:
         notes.append(
             f"Photos hardly correlate with the shading of their depth maps ({photos.best:.2f}): their "
             "registration was not judged."

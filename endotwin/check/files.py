@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from endotwin.sequence import Sequence
+from endotwin.sequence.readers import transforms
 
 
 @dataclass(frozen=True)
@@ -32,7 +33,7 @@ def files_of(sequence: Sequence) -> Files:
     own = "camera.json" if (folder / "camera.json").is_file() else ""
     depth = "the depth maps"
     if sequence.format == "transforms":
-        file = Path(sequence.path).name if Path(sequence.path).is_file() else "transforms.json"
+        file = " and ".join(file.name for file in transforms.files(Path(sequence.path)))
         return Files(file, file, f"depth_unit_scale_factor in {file}", "m, or its 'unit'", "OpenGL")
     if sequence.format == "tum":
         return Files("groundtruth.txt", own or "calibration.txt", f"{depth} (5000 = 1 m)", "m")

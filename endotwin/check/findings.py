@@ -56,7 +56,6 @@ KINDS = {
     "photos_unrelated": "photos do not show what depth maps show",
     "disagreement": "frames disagree under every reading",
     "duplicate": "frames that repeat the one before",
-    "static": "frames between which the camera stands still",
     "blank": "frames whose photos show nothing",
     "blurred": "frames far less sharp than their neighbours",
     "mistimed": "frames whose pose, photo or depth belongs to another frame",

@@ -74,10 +74,8 @@ def _repeated(sequence: Sequence, names: list[str], steps: list[Step]) -> tuple[
         elif near and not stands:
             groups.setdefault("the photo repeats the frame before while the camera moves", []).append(name)
         elif step.same_depth and not stands:
-            depth = sequence.depth_files[step.index].name
-            groups.setdefault("the depth map repeats the frame before while the camera moves", []).append(
-                depth
-            )
+            what = "the depth map repeats the frame before while the camera moves"
+            groups.setdefault(what, []).append(name)
         elif stands and step.change < 1:
             still.append(name)
     change = "Remove these frames, with their poses, or restore the original files."

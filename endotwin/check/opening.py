@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -13,8 +12,8 @@ from endotwin.check.findings import Finding
 from endotwin.errors import CameraError, SequenceError
 from endotwin.sequence import Sequence
 from endotwin.sequence.images import read_color, read_plane
-from endotwin.sequence.poses import AXES_OPENGL_OPENCV, MM_PER_UNIT, RIGID_TOLERANCE, poses_as_written
-from endotwin.sequence.readers import FORMATS, open_sequence
+from endotwin.sequence.poses import AXES_OPENGL_OPENCV, RIGID_TOLERANCE, is_rigid, poses_as_written
+from endotwin.sequence.readers import FORMATS, open_sequence, transforms
 
 
 @dataclass(frozen=True)
@@ -69,8 +68,8 @@ def depth_fault(sequence: Sequence) -> Finding | None:
             f"{sizes[0]}.",
             files.depth,
         )
-    spread = np.unique(np.linspace(0, len(sequence) - 1, 5).astype(int))
-    valid = np.mean([np.isfinite(sequence.read_depth_mm(sequence.depth_files[i])).mean() for i in spread])
+    some = (sequence.read_depth_mm(sequence.depth_files[index]) for index in sequence.spread(5))
+    valid = np.mean([np.isfinite(depth_mm).mean() for depth_mm in some])
     raw = read_plane(sequence.depth_files[0])
     full = (raw == 65535).mean() if raw.dtype == np.uint16 else 0.0
     if full > 0.5 and full > valid:
@@ -89,16 +88,16 @@ def depth_fault(sequence: Sequence) -> Finding | None:
 def _rigid(sequence: Sequence) -> tuple[Sequence, list[Finding]]:
     """Poses made rigid; raises SequenceError where no one mistake explains them."""
     T, files = sequence.T_world_camera, files_of(sequence)
-    if _all_rigid(T):
+    if is_rigid(T).all():
         return sequence, []
     turned, unit_mm = np.eye(4), 1.0
     if sequence.format == "transforms":
-        turned, unit_mm = AXES_OPENGL_OPENCV, _unit_mm(sequence.path)
+        turned, unit_mm = AXES_OPENGL_OPENCV, transforms.pose_unit_mm(Path(sequence.path))
     raw = T @ np.linalg.inv(turned)
     raw[:, :3, 3] /= unit_mm
     transposed = raw.transpose(0, 2, 1) @ turned
     transposed[:, :3, 3] *= unit_mm
-    if _all_rigid(transposed):
+    if is_rigid(transposed).all():
         says = "The pose matrices are written transposed (their translation stands in the wrong place)."
         change = f"Transpose every 4×4 matrix in {files.poses}: rows as columns."
         return _with_poses(sequence, transposed), [Finding("poses_transposed", says, change, files.poses)]
@@ -118,7 +117,7 @@ def _rigid(sequence: Sequence) -> tuple[Sequence, list[Finding]]:
         says = "The poses are left-handed: their rotations have determinant −1."
         change = f"Mirror one axis of the world in {files.poses}: negate one of the first three rows."
         findings.append(Finding("poses_left_handed", says, change, files.poses))
-    if not _all_rigid(scaled):
+    if not is_rigid(scaled).all():
         raise SequenceError("not rigid")
     return _with_poses(sequence, scaled), findings
 
@@ -153,21 +152,9 @@ def _sized(sequence: Sequence) -> tuple[Sequence, list[Finding], tuple[int, int]
     return replace(sequence, camera=camera, image_size=(width, height)), [finding], size
 
 
-def _unit_mm(path: Path) -> float:
-    file = path / "transforms.json" if path.is_dir() else path
-    return MM_PER_UNIT[json.loads(file.read_text(encoding="utf-8")).get("unit", "m")]
-
-
 def _with_poses(sequence: Sequence, T: np.ndarray) -> Sequence:
     left, _, right = np.linalg.svd(T[:, :3, :3])
     T = T.copy()
     T[:, :3, :3] = left @ right
     T[:, 3] = (0, 0, 0, 1)
     return replace(sequence, T_world_camera=T)
-
-
-def _all_rigid(T: np.ndarray) -> bool:
-    gram = T[:, :3, :3].transpose(0, 2, 1) @ T[:, :3, :3]
-    orthonormal = np.abs(gram - np.eye(3)).max(initial=0) <= RIGID_TOLERANCE
-    last_row = np.abs(T[:, 3] - (0, 0, 0, 1)).max(initial=0) <= RIGID_TOLERANCE
-    return bool(orthonormal and last_row and (np.linalg.det(T[:, :3, :3]) > 0).all())

@@ -52,6 +52,7 @@ class Registration:
         best: the correlation then.
         offset: float64 [2], px: where photos lie beside their depth maps; ``error`` [2] its standard error.
             NaN where there are too few rims.
+        All are NaN for pictures so small that none can be moved against another.
     """
 
     correlation: float
@@ -80,6 +81,9 @@ class Registration:
 
 def registration(sequence: Sequence, frames: np.ndarray) -> Registration:
     """Judge a few of ``frames`` [F] and their neighbours in time."""
+    stride = _stride(sequence.camera.width)
+    if min(sequence.camera.width, sequence.camera.height) <= 2 * REACH * stride:
+        return Registration(np.nan, "none", 0, np.nan, np.full(2, np.nan), np.full(2, np.nan))
     centre = frames[spread(len(frames), FRAMES)]
     wanted = sorted({f + k for f in centre.tolist() for k in SHIFTS if 0 <= f + k < len(sequence)})
     photos = dict(zip(wanted, ahead(lambda f: reduced_photo(sequence.color(f)), wanted, 2), strict=True))
@@ -104,7 +108,7 @@ def registration(sequence: Sequence, frames: np.ndarray) -> Registration:
         best = written
     offset, error = np.full(2, np.nan), np.full(2, np.nan)
     if ways[best][0] > LEAST_CORRELATION:
-        start = ways[best][1] * _stride(sequence.camera.width)
+        start = ways[best][1] * stride
         placed = [frame for frame in centre.tolist() if 0 <= frame + best[1] < len(sequence)]
         offset, error = _offset_of(sequence, placed, best, start.astype(float))
     return Registration(ways[written][0], *best, ways[best][0], offset, error)
@@ -157,7 +161,7 @@ def reduced_shading(depth_mm: np.ndarray, rays: np.ndarray, noise: float) -> np.
     z, ray = depth_mm[::stride, ::stride], rays[::stride, ::stride]
     with np.errstate(all="ignore"):
         points = ray * (z / ray[..., 2])[..., None]
-        normal = np.cross(_centred(points, 1), _centred(points, 0))
+        normal = np.cross(np.gradient(points, axis=1), np.gradient(points, axis=0))
         cosine = np.abs((normal * ray).sum(axis=2)) / np.linalg.norm(normal, axis=2)
         level = np.log(np.clip(cosine, 0.1, 1)) + 4 * np.log(ray[..., 2]) - 2 * np.log(z)
     return _high_pass(level, np.isfinite(level) & (ray[..., 2] > LEAST_COSINE))
@@ -264,10 +268,6 @@ def _sampled(image: np.ndarray, uv: np.ndarray) -> np.ndarray:
 
 def _stride(width: int) -> int:
     return max(round(width / GRID), 1)
-
-
-def _centred(points: np.ndarray, axis: int) -> np.ndarray:
-    return np.roll(points, -1, axis) - np.roll(points, 1, axis)
 
 
 def _high_pass(level: np.ndarray, known: np.ndarray) -> np.ndarray:

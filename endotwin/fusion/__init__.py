@@ -71,14 +71,15 @@ def fuse(
 
     Raises:
         SequenceError: no frame has valid depth, or the depth gives no surface.
-        OptionError: a voxel size that is not positive, or no frames.
+        OptionError: a voxel size, or a factor on it, that is not positive or that no memory holds; no frames.
     """
     frames = list(range(len(sequence)) if frames is None else frames)
     photo_frames = frames if photo_frames is None else list(photo_frames)
     if not frames:
         raise OptionError("No frames are left to fuse; choose at least one.")
-    if voxel_mm is not None and not voxel_mm > 0:
-        raise OptionError(f"The voxel size is {voxel_mm:g} mm, but must be greater than 0.")
+    for what, value in ((f"voxel size is {voxel_mm} mm", voxel_mm), (f"factor on voxels is {voxel}", voxel)):
+        if value is not None and not value > 0:
+            raise OptionError(f"The {what}, but must be greater than 0.")
     sequence.require_valid_depth()
     camera, sample = sequence.camera, [frames[k] for k in spread(len(frames), SAMPLED_FRAMES)]
 
@@ -93,25 +94,22 @@ def fuse(
     if width_px >= 1:
         reading = {"shelf": Shelf(), "change": partial(denoised, noise=scatter, width_px=width_px)}
     doubt_positions(sequence, frames, median_mm)
-    if voxel_mm is not None and voxel_mm > median_mm:
-        raise OptionError(
-            f"A voxel of {voxel_mm:g} mm is larger than the usual depth, {median_mm:.3g} mm; choose less."
-        )
-    if voxel_mm is not None and voxel_mm < least_mm:
-        raise OptionError(
-            f"A voxel of {voxel_mm:g} mm needs more than 2 GB of memory; choose {least_mm:.2g} or more."
-        )
+    if voxel_mm is not None:
+        _check_voxel(voxel_mm, median_mm, least_mm)
     origin_mm = np.median(np.asarray(sequence.T_world_camera, np.float64)[frames, :3, 3], axis=0)
     coarse_mm = COARSE_VOXELS * max(finest_mm, voxel_mm or 0.0)
     coarse = fuse_tsdf(camera, views("noise", sample), origin_mm, coarse_mm, noise_mm=0.0)
     noise = measured_noise(camera, surface_of(origin_mm, *coarse), views("noise", sample))
-    voxel_mm = voxel * max(finest_mm, noise * median_mm) if voxel_mm is None else voxel_mm
+    if voxel_mm is None:
+        voxel_mm = voxel * max(finest_mm, noise * median_mm)
+        _check_voxel(voxel_mm, median_mm, least_mm)
     tolerance = Tolerance.of(voxel_mm, noise)
     doubt_scatter(sequence, max(noise, scatter))
 
     seen = None
     if len(frames) * camera.width * camera.height > WORTH_PIXELS:
         seen = glances(sequence, _reported("choose frames", frames, progress))
+        frames = [glance.index for glance in seen]
     fused = frames if seen is None else chosen(camera, seen, 1 if width_px < 1 else NOISY_FOLD)
     vertices_mm, triangles = fuse_tsdf(
         camera, views("TSDF", fused, warn=True), origin_mm, voxel_mm, noise * median_mm
@@ -121,12 +119,12 @@ def fuse(
     surface = refined(
         camera, surface, views("refine", fused), max(voxel_mm, REACH_SIGMAS * noise * median_mm)
     )
-    surface, shares = reconciled(camera, surface, views("carve and patch", fused), tolerance, voxel_mm)
+    surface, shares = reconciled(camera, surface, views("carve and patch", fused), tolerance)
     if seen is not None:
         shares, places = compared(camera, Caster(surface), seen, tolerance)
         fused = sorted([*fused, *differing(places, fused)])
     doubt_frames(sequence, shares)
-    surface, _ = reconciled(camera, surface, views("carve and patch again", fused), tolerance, voxel_mm)
+    surface, _ = reconciled(camera, surface, views("carve and patch again", fused), tolerance)
     surface = filled(camera, surface, views("fill holes", fused), tolerance, voxel_mm)
     strips = (views(stage, fused) for stage in ("go on beside pictures", "keep what is sound"))
     surface = with_margin(camera, surface, *strips, tolerance, median_mm)
@@ -140,6 +138,18 @@ def fuse(
     if record is not None:
         record.update(fused=fused, nothing_new=len(frames) - len(fused))
     return surface
+
+
+def _check_voxel(voxel_mm: float, median_mm: float, least_mm: float) -> None:
+    """Raise OptionError for voxels larger than the ``median_mm`` of depth, or smaller than memory holds."""
+    if voxel_mm > median_mm:
+        raise OptionError(
+            f"A voxel of {voxel_mm:g} mm is larger than the usual depth, {median_mm:.3g} mm; choose less."
+        )
+    if voxel_mm < least_mm:
+        raise OptionError(
+            f"A voxel of {voxel_mm:g} mm needs more than 2 GB of memory; choose {least_mm:.2g} or more."
+        )
 
 
 def _reported(stage: str, frames: list[int], progress: Progress | None) -> Iterable[int]:

@@ -17,6 +17,7 @@ import numpy as np
 from endotwin.cameras import Camera
 from endotwin.fusion.agreement import Tolerance
 from endotwin.fusion.faces import distance_mm
+from endotwin.fusion.views import warn_skipped
 from endotwin.run.ahead import ahead
 from endotwin.run.threads import THREADS
 from endotwin.sequence import Sequence
@@ -63,13 +64,19 @@ class Glance:
 
 
 def glances(sequence: Sequence, frames: Iterable[int]) -> list[Glance]:
-    """A glance at each of ``frames``, without those that measured nothing."""
+    """A glance at each of ``frames``; those that measured nothing are left out, and named in the log."""
 
     def glance(index: int) -> Glance:
         distances_mm = distance_mm(sequence.camera, sequence.depth_mm(index))
         return Glance(index, sequence.T_world_camera[index], distances_mm[::STRIDE, ::STRIDE].copy())
 
-    return [seen for seen in ahead(glance, frames, THREADS) if np.isfinite(seen.distance_mm).any()]
+    found = []
+    for seen in ahead(glance, frames, THREADS):
+        if np.isfinite(seen.distance_mm).any():
+            found.append(seen)
+        else:
+            warn_skipped(sequence, seen.index)
+    return found
 
 
 def chosen(camera: Camera, seen: list[Glance], fold: int = 1) -> list[int]:

@@ -109,7 +109,6 @@ def without_short_edges(
 ) -> tuple[np.ndarray, np.ndarray]:
     """The mesh with vertices that an edge shorter than ``shortest_mm`` joins made one, at their mean."""
     edges = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
-    edges = edges[edges[:, 0] < edges[:, 1]]
     short = np.linalg.norm(vertices_mm[edges[:, 0]] - vertices_mm[edges[:, 1]], axis=1) < shortest_mm
     number = joined(len(vertices_mm), edges[short])
     count = np.bincount(number)

@@ -17,7 +17,7 @@ from endotwin.surface.casting import Caster
 
 
 def reconciled(
-    camera: Camera, surface: Surface, views: Iterable[View], tolerance: Tolerance, voxel_mm: float
+    camera: Camera, surface: Surface, views: Iterable[View], tolerance: Tolerance
 ) -> tuple[Surface, dict[int, float]]:
     """``surface`` without what hides measured pixels, and with what they lack; each view is cast once.
 

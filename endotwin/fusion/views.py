@@ -76,4 +76,9 @@ def read_views(
         if np.isfinite(view.distance_mm).any():
             yield view
         elif warn:
-            logger.warning("%s has no valid depth and is skipped.", sequence.depth_files[view.index])
+            warn_skipped(sequence, view.index)
+
+
+def warn_skipped(sequence: Sequence, index: int) -> None:
+    """Name a frame that has no depth in the log."""
+    logger.warning("%s has no valid depth and is skipped.", sequence.depth_files[index])

@@ -48,7 +48,7 @@ class View:
     """One rendered view and the labels that come with it.
 
     Attributes:
-        color: float32 [H, W, 3], display-encoded, in [0, 1]; 0 where no surface is seen.
+        color: float32 [H, W, 3], display-encoded, in [0, 1]; 0 where no part of a pixel shows surface.
         radiance: float32 [H, W, 3], linear, before the response; 1 is display white.
         hits: the pixel → surface correspondences behind it.
         shape: (H, W).
@@ -189,8 +189,9 @@ class Renderer:
         """
         T_world_camera = as_pose(T_world_camera)
         shape = (self.camera.height, self.camera.width)
-        if mask is not None and np.shape(mask) != shape:
-            raise OptionError(f"the mask has the shape {np.shape(mask)}, but the image {shape}")
+        mask = None if mask is None else np.asarray(mask, bool)
+        if mask is not None and mask.shape != shape:
+            raise OptionError(f"the mask has the shape {mask.shape}, but the image {shape}")
         light = self._illumination.at(T_world_camera)
         if like:
             met, radiance = like._met, like._met.centres.image(light, shape)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -86,11 +85,11 @@ def rigid(matrices: np.ndarray, where: Callable[[int], str]) -> np.ndarray:
     )
     if _AS_WRITTEN.get():
         return matrices
-    bad = ~_is_rigid(matrices)
+    bad = ~is_rigid(matrices)
     if bad.any():
         first = int(bad.argmax())
         remedy = "mend the rotation or remove that frame"
-        if _is_rigid(matrices[first : first + 1].transpose(0, 2, 1))[0]:
+        if is_rigid(matrices[first : first + 1].transpose(0, 2, 1))[0]:
             remedy = "its transpose would be, so write the file's matrices transposed, rows as columns"
         elif np.linalg.det(matrices[first, :3, :3]) < 0:
             remedy = "its axes are left-handed (determinant −1), so mirror one axis of world and camera alike"
@@ -163,20 +162,6 @@ def write_tum_poses(path: Path, T_world_camera: np.ndarray, timestamps_s: np.nda
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
-def write_transforms_poses(path: Path, T_world_camera: np.ndarray, source: Path) -> None:
-    """Write the ``transforms.json`` at ``source`` again, with poses [N, 4, 4] in mm, in order of names."""
-    content = read_json(source)
-    poses = T_world_camera @ AXES_OPENGL_OPENCV
-    poses[:, :3, 3] /= transforms_unit_mm(content, source)
-    _, frames = read_transforms_poses(source)
-    named = {
-        str(frame.get("file_path", "")): pose.tolist() for frame, pose in zip(frames, poses, strict=True)
-    }
-    for frame in content["frames"]:
-        frame["transform_matrix"] = named[str(frame.get("file_path", ""))]
-    path.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
-
-
 def read_tum_poses(path: Path) -> tuple[np.ndarray, np.ndarray]:
     """``T_world_camera`` float64 [N, 4, 4], mm, and timestamps in seconds [N] of a TUM file, in metres."""
     rows, lines = numeric_rows(path, 8, TUM_ROW)
@@ -187,7 +172,8 @@ def read_tum_poses(path: Path) -> tuple[np.ndarray, np.ndarray]:
 def read_transforms_poses(path: Path) -> tuple[np.ndarray, list[dict]]:
     """``T_world_camera`` float64 [N, 4, 4], mm, and the frames of a ``transforms.json``, in order of names.
 
-    Its cameras look along −z with y up (OpenGL). Its unit is the metre, unless it has ``"unit": "mm"``.
+    Its cameras look along −z with y up (OpenGL). Its unit is the metre, unless it has ``"unit": "mm"``; where
+    it has nerfstudio's ``applied_scale``, positions were multiplied by that, and depth was not.
     """
     content = read_json(path)
     frames = content.get("frames")
@@ -207,7 +193,7 @@ def read_transforms_poses(path: Path) -> tuple[np.ndarray, list[dict]]:
                 f"{path}, frame {name}: not a pose; a valid transform_matrix is 4 rows of 4 numbers"
             ) from error
     poses = rigid(matrices, lambda i: f"{path}, frame {frames[i].get('file_path', i)}") @ AXES_OPENGL_OPENCV
-    poses[:, :3, 3] *= transforms_unit_mm(content, path)
+    poses[:, :3, 3] *= transforms_pose_unit_mm(content, path)
     return poses, frames
 
 
@@ -217,6 +203,14 @@ def transforms_unit_mm(content: dict, path: Path) -> float:
     if not isinstance(unit, str) or unit not in MM_PER_UNIT:
         raise SequenceError(f"{path} has the unit {unit!r}; set 'unit' to one of {', '.join(MM_PER_UNIT)}")
     return MM_PER_UNIT[unit]
+
+
+def transforms_pose_unit_mm(content: dict, path: Path) -> float:
+    """Millimetres in the unit of the positions, as ``transforms_unit_mm``."""
+    applied = content.get("applied_scale", 1)
+    if isinstance(applied, bool) or not isinstance(applied, int | float) or not 0 < applied < np.inf:
+        raise SequenceError(f"{path}: 'applied_scale' is {applied!r}; set it to a positive number")
+    return transforms_unit_mm(content, path) / applied
 
 
 def numeric_rows(path: Path, columns: int, valid_row: str) -> tuple[np.ndarray, list[int]]:
@@ -272,7 +266,7 @@ def _require(good: np.ndarray, where: Callable[[int], str], fault: str) -> None:
         raise SequenceError(f"{where(int(good.argmin()))}: the pose {fault}")
 
 
-def _is_rigid(matrices: np.ndarray) -> np.ndarray:
+def is_rigid(matrices: np.ndarray) -> np.ndarray:
     """Bool [N]: rotation, no reflection, last row (0, 0, 0, 1), within the tolerance."""
     rotation = matrices[:, :3, :3]
     gram = rotation.transpose(0, 2, 1) @ rotation

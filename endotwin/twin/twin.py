@@ -154,6 +154,13 @@ class Source:
         """The sequence, of which the frames that are left out are not looked at."""
         return sequence if self.split is None else replace(sequence, split=self.split)
 
+    def shrunk(self, factor: float) -> Source:
+        """The same source, its images ``factor`` times as large."""
+        if self.undistort is None:
+            return replace(self, scale=factor * self.scale)
+        width, height = (round(factor * size) for size in self.undistort)
+        return replace(self, undistort=(width, height))
+
     def heldout(self, count: int) -> list[int]:
         """Indices of the held-out frames among ``count``; none where that would leave nothing to fit."""
         if self.split is not None:

@@ -1,8 +1,9 @@
 """``transforms.json`` of nerfstudio and instant-ngp, with depth maps.
 
-Unit: positions are metres, as nerfstudio has it, unless the file says ``"unit": "mm"``; depth in that
-unit is the stored value times ``depth_unit_scale_factor`` (0.001 unless given: 16-bit millimetres beside
-positions in metres; 1 for OpenEXR, as renderers write it), or times instant-ngp's ``integer_depth_scale``.
+Unit: positions are metres, as nerfstudio has it, unless the file says ``"unit": "mm"``, times its
+``applied_scale`` if it has one, by which depth is not multiplied; depth in that unit is the stored value
+times ``depth_unit_scale_factor`` (0.001 unless given: 16-bit millimetres beside positions in metres; 1 for
+OpenEXR, as renderers write it), or times instant-ngp's ``integer_depth_scale``.
 Depth is z-depth, 0 for none; PNG, TIFF, NPY, NPZ and OpenEXR are read. A frame's depth map is its
 ``depth_file_path`` (instant-ngp: ``depth_path``), or else ``depth/NAME.*`` beside the photo's folder, or
 ``NAME_depth.*`` beside the photo. Where a frame's ``mask_path`` is 0, there is no depth. Principal points
@@ -15,9 +16,10 @@ unused.
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from functools import partial
-from math import isfinite, tan
+from math import isfinite, pi, tan
 from pathlib import Path
 
 import numpy as np
@@ -27,11 +29,15 @@ from endotwin.errors import CameraError, SequenceError
 from endotwin.sequence.floatdepth import SUFFIXES, in_mm
 from endotwin.sequence.images import read_color, read_plane
 from endotwin.sequence.poses import (
+    AXES_OPENGL_OPENCV,
     frame_times,
     read_json,
     read_transforms_poses,
+    transforms_pose_unit_mm,
     transforms_unit_mm,
 )
+from endotwin.sequence.readers.split import HELD_OUT as HELD_OUT_LIST
+from endotwin.sequence.readers.split import TRAINING as TRAINING_LIST
 from endotwin.sequence.readers.split import Listing, joined, of_files, of_lists
 from endotwin.sequence.sequence import Sequence
 
@@ -66,7 +72,7 @@ def detects(path: Path) -> bool:
 
 def read(path: Path) -> Sequence:
     """The sequence of a ``transforms.json`` or of the folder that holds it, at its native size."""
-    listings = [_listing(file) for file in _files(path)]
+    listings = [_listing(file) for file in files(path)]
     every = joined(listings)
     return Sequence(
         path=path,
@@ -81,7 +87,32 @@ def read(path: Path) -> Sequence:
     )
 
 
-def _files(path: Path) -> list[Path]:
+def write_poses(path: Path, sequence: Sequence) -> None:
+    """Write what lists the frames of ``sequence`` again, with its poses; two files as one that lists a
+    split."""
+    listings = [_listing(file) for file in files(sequence.path)]
+    poses = sequence.T_world_camera @ AXES_OPENGL_OPENCV
+    poses[:, :3, 3] /= transforms_pose_unit_mm(listings[0].content, listings[0].file)
+    pose_of = dict(zip(sequence.color_files, poses.tolist(), strict=True))
+    frames = [
+        {**frame, "transform_matrix": pose_of[photo]}
+        for listing in listings
+        for frame, photo in zip(listing.frames, listing.color_files, strict=True)
+    ]
+    content = {**listings[0].content, "frames": frames}
+    if len(listings) > 1:
+        names = ([frame["file_path"] for frame in listing.frames] for listing in listings)
+        content |= dict(zip((TRAINING_LIST, HELD_OUT_LIST), names, strict=True))
+    path.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+
+
+def pose_unit_mm(path: Path) -> float:
+    """Millimetres in the unit of the positions of ``path``."""
+    file = files(path)[0]
+    return transforms_pose_unit_mm(read_json(file), file)
+
+
+def files(path: Path) -> list[Path]:
     """The files that list the frames of ``path``: one, or that to be fitted and that to be scored by."""
     if path.is_file():
         return [path]
@@ -212,6 +243,8 @@ def _description(file: Path, given: dict) -> dict:
     if model not in (*PINHOLES, FISHEYE):
         known = ", ".join((*PINHOLES, FISHEYE))
         raise CameraError(f"{file}: camera model {model!r} is unknown; set 'camera_model' to one of {known}")
+    if model != FISHEYE and given.get("is_fisheye"):
+        raise CameraError(f"{file} says 'is_fisheye' and {model!r}; remove one of both")
     if model == FISHEYE:
         distortion = {key: distortion[key] for key in ("k1", "k2", "k3", "k4")}
     elif distortion.pop("k4"):
@@ -235,5 +268,6 @@ def _description(file: Path, given: dict) -> dict:
 
 
 def _focal(angle: float | None, size: float) -> float | None:
-    """Focal length in pixels of a pinhole whose image of ``size`` pixels spans ``angle`` radians."""
-    return None if angle is None else size / 2 / tan(angle / 2)
+    """Focal length in pixels of a pinhole whose image of ``size`` pixels spans ``angle`` radians; None where
+    there is no angle that an image can span."""
+    return size / 2 / tan(angle / 2) if angle and 0 < angle < pi else None
