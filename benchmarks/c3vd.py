@@ -16,6 +16,7 @@ import csv
 import html
 import json
 import math
+import shutil
 import subprocess
 import sys
 from dataclasses import dataclass
@@ -121,12 +122,16 @@ def endotwin(*arguments: object) -> subprocess.CompletedProcess:
 def score(folder: Path, options: tuple[str, ...], work: Path) -> dict:
     """What a sequence gave: the scores and the cost of each step, or the error that ended it.
 
-    Steps that an earlier run has done are not done again.
+    Steps that an earlier run of the same folder and options has done are not done again.
     """
-    twin, kept = work / "twin", work / "row.json"
+    twin, kept, note = work / "twin", work / "row.json", work / "asked.json"
+    asked = json.dumps([str(folder.resolve()), *options])
+    if not note.exists() or note.read_text(encoding="utf-8") != asked:
+        shutil.rmtree(work, ignore_errors=True)
+        work.mkdir(parents=True)
+        note.write_text(asked, encoding="utf-8")
     if kept.exists():
         return json.loads(kept.read_text(encoding="utf-8"))
-    work.mkdir(parents=True, exist_ok=True)
     steps = {"fuse": ("fuse", folder, "-o", twin, *options), "align": ("align", twin), "fit": ("fit", twin)}
     if endotwin("align", "--help").returncode:
         del steps["align"]  # of a version that has it not

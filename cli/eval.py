@@ -91,9 +91,11 @@ def evaluate(
             from endotwin.twin import Twin
         with run.stage("load"):
             twin = None if twin_folder is None else Twin.load(twin_folder)
-            other = None if sequence is None else open_sequence(sequence, scale=scale or 1.0)
+            size = 1.0 if scale is None else scale
+            other = None if sequence is None else open_sequence(sequence, scale=size)
         with run.stage("eval"):
-            scored = twin if twin is None or scale is None else twin.at_scale(scale)
+            own_photos = twin is not None and other is None
+            scored = twin.at_scale(scale) if own_photos and scale is not None else twin
             evaluation = evaluate(scored, sheet, run.progress, overwrite, other, renders, halves, lpips)
         print(json_format.dumps(evaluation.to_dict()) if json else evaluation)
         with run.stage("write"):

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import logging
-import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, replace
-from numbers import Integral
+from numbers import Integral, Real
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -15,6 +14,7 @@ from endotwin.config import STANDARD, FitConfig, FuseConfig
 from endotwin.errors import OptionError, SequenceError, TwinError
 from endotwin.fit import fit
 from endotwin.render.price import priced
+from endotwin.run.arguments import check_positive, check_whole, texts
 from endotwin.run.stopwatch import Stopwatch
 from endotwin.sequence.readers import open_sequence
 from endotwin.twin import Source, Twin, as_twin
@@ -42,7 +42,7 @@ def fuse_twin(
     config: FuseConfig = STANDARD.fuse,
     progress: Progress | None = None,
     undistort: tuple[int, int] | None = None,
-    without: Iterable[int] = (),
+    without: Iterable[int] | int = (),
 ) -> Twin:
     """Fuse the depth maps of a sequence into a twin that has a surface and no materials yet.
 
@@ -65,9 +65,9 @@ def fuse_twin(
     if geometry not in GEOMETRIES:
         raise OptionError(f"geometry {geometry!r} is unknown; choose one of {', '.join(GEOMETRIES)}")
     scale = config.scale if scale is None else scale
-    _check_positive("scale", scale)
+    check_positive("scale", scale)
     if voxel_mm is not None:
-        _check_positive("voxel size", voxel_mm)
+        check_positive("voxel size", voxel_mm)
     stopwatch = Stopwatch()
     with stopwatch.stage("open"):
         sequence = open_sequence(path, format=format, scale=scale, undistort=undistort)
@@ -80,7 +80,7 @@ def fuse_twin(
         split=sequence.split,
         undistort=undistort,
     )
-    if left_out := list(without):
+    if left_out := [without] if isinstance(without, Real) else list(without):
         _check_frames(left_out, sequence)
         source = source.without(left_out, len(sequence))
         sequence = source.limited(sequence)
@@ -167,10 +167,11 @@ def fit_twin(
         OptionError: an option makes no sense. SequenceError: the twin's sequence has moved or cannot be read.
         TwinError: polyps were grown on the twin.
     """
-    for name, value in (("budget", budget_s), ("number of epochs", epochs)):
-        if value is not None:
-            _check_positive(name, value)
-    _check_seed(seed)
+    if budget_s is not None:
+        check_positive("budget", budget_s)
+    if epochs is not None:
+        check_whole("number of epochs", epochs, 1)
+    check_whole("seed", seed)
     twin = _as_recorded(twin)
     config = replace(config, method=method or config.method, budget=budget_s or config.budget)
     undecided = "align" not in twin.record and config.method == "twin" and config.budget is None
@@ -245,6 +246,7 @@ def synthesize(
     """
     from endotwin.synth import Crew, render_dataset
 
+    check_whole("number of workers", workers)
     wanted = (motion, polyps, fluids, labels, layout, limits, seed)
     with Crew(1 if scheduler else workers) as crew:
         job = _job(twin, trajectory, material, light, vary, camera, effects, *wanted, crew.expected)
@@ -272,13 +274,9 @@ def with_polyps(
     Raises:
         TwinError: the twin is not fitted. OptionError: a polyp is not understood, or does not fit in.
     """
-    from endotwin import synth
+    from endotwin.synth import with_polyps
 
-    twin = as_twin(twin)
-    poses = None
-    if trajectory is not None:
-        poses = synth.parse_trajectory(trajectory, twin, seed, twin.camera, limits)
-    return synth.with_polyps(twin, polyps, seed, poses)[0]
+    return _with(with_polyps, twin, polyps, trajectory, seed, limits)
 
 
 def with_fluids(
@@ -301,13 +299,27 @@ def with_fluids(
     Raises:
         TwinError: the twin is not fitted. OptionError: a fluid is not understood, or finds no place.
     """
-    from endotwin import synth
+    from endotwin.synth import with_fluids
 
-    twin = as_twin(twin)
-    poses = None
+    return _with(with_fluids, twin, fluids, trajectory, seed, limits)
+
+
+def _with(
+    added: Callable[..., tuple],
+    twin: Twin | Path | str,
+    specs: Iterable[str] | str,
+    trajectory: str | Path | np.ndarray | None,
+    seed: int,
+    limits: Limits | None,
+) -> Twin:
+    """The twin with what ``specs`` ask for ``added``, where the ``trajectory`` sees the wall."""
+    from endotwin.synth import parse_trajectory
+
+    check_whole("seed", seed)
+    twin, poses = as_twin(twin), None
     if trajectory is not None:
-        poses = synth.parse_trajectory(trajectory, twin, seed, twin.camera, limits)
-    return synth.with_fluids(twin, fluids, seed, poses)[0]
+        poses = parse_trajectory(trajectory, twin, seed, twin.camera, limits)
+    return added(twin, specs, seed, poses)[0]
 
 
 def preview(
@@ -363,16 +375,15 @@ def _job(
     twin = as_twin(twin)
     lens = read_camera(Path(camera)) if camera else twin.camera
     twin = synth.equipped(twin, effects or {}, trajectory)
-    _check_seed(seed)
-    material, light = _texts("material", material), _texts("light", light)
-    edits = [synth.parse_material_edit(edit) for edit in material]
-    variation = synth.fixed(edits, [synth.parse_light_edit(edit) for edit in light])
+    check_whole("seed", seed)
+    edits = [synth.parse_material_edit(edit) for edit in texts("material", material)]
+    variation = synth.fixed(edits, [synth.parse_light_edit(edit) for edit in texts("light", light)])
     if vary:
         variation = synth.read_variation(Path(vary), twin, variation)
     grows, wet = bool(polyps or twin.polyps), bool(fluids or twin.fluids)
     chosen = (*synth.DEFAULT_LABELS, *(("polyp",) if grows else ()), *(("fluid",) if wet else ()))
     if labels is not None:
-        chosen = synth.parse_labels(",".join(_texts("labels", labels)), bool(motion), grows, wet)
+        chosen = synth.parse_labels(",".join(texts("labels", labels)), bool(motion), grows, wet)
     poses = synth.parse_trajectory(trajectory, twin, seed, lens, limits)
     expected(len(poses) * lens.width * lens.height)
     for added, specs in ((synth.with_polyps, polyps), (synth.with_fluids, fluids)):
@@ -385,29 +396,9 @@ def _job(
     return synth.make_job(twin, poses, seed, chosen, layout, lens, variation, moving)
 
 
-def _check_frames(left_out: list[int], sequence: Sequence) -> None:
+def _check_frames(left_out: Iterable[int], sequence: Sequence) -> None:
     for index in left_out:
         if not isinstance(index, Integral) or not 0 <= index < len(sequence):
             raise OptionError(
                 f"{sequence.path} has no frame {index} to leave out: its frames are 0 to {len(sequence) - 1}"
             )
-
-
-def _check_seed(seed: int) -> None:
-    if not isinstance(seed, Integral) or seed < 0:
-        raise OptionError(f"the seed is {seed!r}, but must be a whole number, 0 or more")
-
-
-def _texts(name: str, given: Iterable[str] | str) -> list[str]:
-    try:
-        each = [given] if isinstance(given, str) else list(given)
-    except TypeError:
-        each = [given]
-    if not all(isinstance(text, str) for text in each):
-        raise OptionError(f"{name} is {given!r}, but must be a text or a list of texts")
-    return each
-
-
-def _check_positive(name: str, value: float) -> None:
-    if not (math.isfinite(value) and value > 0):
-        raise OptionError(f"the {name} is {value:g}, but must be greater than 0")

@@ -112,6 +112,13 @@ def test_the_expansion_is_exact_where_it_was_made_and_follows_the_light(sphere):
     np.testing.assert_allclose(bounce.irradiance(0.55, 1.95, 0.15), moved, rtol=0.01)
 
 
+def test_no_points_have_an_expansion_too(sphere):
+    light, places, albedo = sphere
+    none = Places(places.weights[:0], places.view[:0])
+    bounce = light.expanded(none, 0.5, 2.0, albedo, torch.zeros(0), seen_by=(0.45, albedo))
+    assert bounce.irradiance(0.5, 2.0).shape == (0, 3) and bounce.by_q.shape == (0,)
+
+
 def test_the_expansion_by_the_scale_alone_is_exact_there_too_and_still_in_all_else(sphere):
     light, places, albedo = sphere
     whole, part = (

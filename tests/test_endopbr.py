@@ -10,8 +10,9 @@ from scenes import look, pinhole, sphere
 
 import endotwin
 from endotwin.fit import endopbr
+from endotwin.fit.checkpoint import Checkpoint, identity
 from endotwin.surface import Surface
-from endotwin.twin import Source, Twin
+from endotwin.twin import Registration, Source, Twin
 
 pytestmark = pytest.mark.slow
 
@@ -126,6 +127,20 @@ def test_the_same_seed_gives_the_same_twin(tube):
     one, other = (endotwin.fit_twin(tube, "endopbr", epochs=1, seed=5) for _ in range(2))
     np.testing.assert_allclose(one.materials.base_color, other.materials.base_color, atol=1e-5)
     np.testing.assert_allclose(one.light.L0, other.light.L0, rtol=1e-4)
+
+
+def test_a_training_goes_on_only_from_the_same_photos_places_and_not_from_beyond_its_end(tube, tmp_path):
+    moved = replace(tube, registration=Registration(((1.0,) * 6,) * 10))
+    assert identity(moved) != identity(tube)
+    parameter = torch.nn.Parameter(torch.zeros(3))
+    optimizer = torch.optim.Adam([parameter])
+    parameter.grad = torch.ones(3)
+    optimizer.step()
+    kept = Checkpoint(tmp_path / "kept", identity(tube), optimizer)
+    kept._written = -np.inf
+    kept.keep(7, 1.5)
+    assert kept.resume(7) == (7, 1.5) and kept.resume(6) == (0, 0.0)
+    assert Checkpoint(tmp_path / "kept", identity(moved), optimizer).resume(7) == (0, 0.0)
 
 
 def test_a_budget_ends_the_training(tube):

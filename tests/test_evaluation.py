@@ -2,6 +2,8 @@
 
 import json
 from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -12,6 +14,7 @@ from endotwin.effects.gain import Gain
 from endotwin.errors import OptionError, OutputError, SequenceError, TwinError
 from endotwin.evaluation import evaluate
 from endotwin.evaluation.evaluation import MEANS
+from endotwin.evaluation.renders import rendered_files
 from endotwin.pipeline import fuse_twin
 from endotwin.render import Renderer
 from endotwin.sequence.readers import open_sequence
@@ -185,6 +188,15 @@ def test_renders_of_another_method_are_scored_by_the_twins_own_ruler(twin, tmp_p
     assert "γ" not in str(alone) and np.isnan(alone.covered)
 
 
+def test_no_picture_stands_for_two_photos(tmp_path, caplog):
+    files = [tmp_path / f"0000{k}.png" for k in range(3)]
+    for file in files:
+        file.touch()
+    photos = SimpleNamespace(color_files=[Path(f"frame{k:04d}_v2.png") for k in range(17)])
+    assert list(rendered_files(tmp_path, photos, [0, 8, 16]).values()) == files
+    assert "taken in order" in caplog.text
+
+
 def test_a_render_that_is_missing_or_of_another_size_is_told(twin, tmp_path):
     _renders(twin, tmp_path / "theirs", ("0000_color.png", "0008_color.png"))
     cv2.imwrite(str(tmp_path / "theirs" / "0008_color.png"), np.zeros((5, 7, 3), np.uint8))
@@ -207,6 +219,9 @@ def test_a_twin_is_scored_on_every_frame_of_another_recording_through_its_own_ca
     assert scores.psnr == pytest.approx(-10 * np.log10((1 / 255) ** 2 / 12), abs=1.0)
     with pytest.raises(OptionError, match="the twin's own sequence"):
         evaluate(twin, sequence=twin.source.path)
+    by_its_file = replace(twin.source.open(), path=Path(twin.source.path) / "transforms.json")
+    with pytest.raises(OptionError, match="the twin's own sequence"):
+        evaluate(twin, sequence=by_its_file)
     with pytest.raises(OptionError, match="no photos to be compared with"):
         evaluate(renders=tmp_path)
 

@@ -142,3 +142,9 @@ def test_a_window_fits_the_screen_that_it_is_shown_on():
     for screen in ((1366, 768), (1024, 1366)):
         width, height = inspector._fitting((1440, 1080), screen)
         assert width < screen[0] and height < screen[1] and abs(width / height - 4 / 3) < 0.01
+
+
+def test_limits_of_a_map_ascend_whatever_its_values():
+    for values in ([2.0, 3, 5, 6], [0.5] * 4, [0.0, 1], [1.0] * 3, []):
+        low, high = inspector._limits(np.array(values))
+        assert 0 <= low < high

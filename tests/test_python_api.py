@@ -162,11 +162,33 @@ def test_labels_that_are_none_are_refused(twin, tmp_path, labels):
 
 
 @pytest.mark.parametrize(
-    "wrong", [{"seed": 1.5}, {"seed": -1}, {"labels": 3}, {"material": 3}, {"light": [1]}]
+    "wrong",
+    [
+        *({"seed": 1.5}, {"seed": -1}, {"labels": 3}, {"material": 3}, {"light": [1]}, {"motion": 3}),
+        *({"workers": "x"}, {"workers": -1}, {"effects": ["noise"]}, {"effects": {"noise": "maybe"}}),
+    ],
 )
 def test_arguments_of_another_type_are_refused(twin, tmp_path, wrong):
-    with pytest.raises(OptionError, match=next(iter(wrong))):
+    with pytest.raises(OptionError, match="|".join([*wrong, "choice of an effect"])):
         endotwin.synthesize(twin, [tube_twin.pose(0.5)], tmp_path / "dataset", **wrong)
+
+
+def test_arguments_of_another_type_end_no_fuse_or_fit_halfway(twin, made):
+    for told, wrong in (
+        ("scale", {"scale": "0.5"}),
+        ("frame", {"without": 3.5}),
+        ("width and a height", {"undistort": 64}),
+    ):
+        with pytest.raises(OptionError, match=told):
+            endotwin.fuse_twin(made / "tube", **wrong)
+    for told, wrong in (
+        ("budget", {"budget_s": "10s"}),
+        ("epochs", {"method": "endopbr", "epochs": 1.5}),
+        ("gian=on", {"effects": {"gian": "on"}, "align": "off"}),
+        ("gain=maybe", {"effects": {"gain": "maybe"}, "align": "off"}),
+    ):
+        with pytest.raises(OptionError, match=told):
+            endotwin.fit_twin(twin, **wrong)
 
 
 def test_a_view_is_from_one_pose(twin):

@@ -13,7 +13,7 @@ from endotwin.config import FitConfig
 from endotwin.effects import Effects
 from endotwin.fit import fit
 from endotwin.fit.gauss_newton import GaussNewton
-from endotwin.fit.tilt import Tilter
+from endotwin.fit.tilt import Tilter, falling_on
 from endotwin.surface.vectors import unit
 
 pytestmark = pytest.mark.slow
@@ -62,6 +62,17 @@ def test_with_the_true_materials_disturbed_normals_are_found_again():
         return float(np.degrees(np.arccos(np.clip(cos, -1, 1))).mean())
 
     assert off_deg(found) < 0.85 * off_deg(disturbed)
+
+
+def test_light_falls_on_new_normals_as_on_a_surface_that_had_them():
+    twin = tube_twin.fitted(tube_twin.seen(tube_twin.surface(fold_mm=2.0)))
+    off = np.radians(2.0) * np.random.default_rng(1).normal(size=twin.surface.normals.shape)
+    surface = replace(twin.surface, normals=unit((twin.surface.normals + off).astype(np.float32)))
+    camera, poses = Pinhole(64, 48, 40.0, 40.0, 31.5, 23.5), tube_twin.pose(0.5)[None]
+    fallen = falling_on(surface, tube_twin.photographed(twin, camera, poses), Effects())
+    expected = tube_twin.photographed(replace(twin, surface=surface), camera, poses)
+    for name in ("cos", "sin2"):
+        torch.testing.assert_close(getattr(fallen, name), getattr(expected, name), atol=1e-5, rtol=0)
 
 
 def test_normals_stay_unit_and_without_tilts_they_stay_as_they_are(fitted):

@@ -123,6 +123,8 @@ def test_a_rung_may_force_effects_of_a_preset_a_file_or_turned_knobs(tmp_path):
         ("voxel=0", "rung 'voxel=0': fuse.voxel"),
         ("draft,draft", "twice"),
         ("budget=soon", "soon"),
+        ("voxel=[", r"rung 'voxel=\['.*no value"),
+        ("voxel=2024-13-45", "rung 'voxel=2024-13-45'"),
     ],
 )
 def test_a_rung_that_means_nothing_is_refused(names, told):

@@ -10,7 +10,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict
 from importlib import import_module
 
-from endotwin.effects.effect import STATES, Decision, Effect
+from endotwin.effects.effect import STATES, Decision, Effect, unjudged
 from endotwin.errors import OptionError
 
 FITTED = (
@@ -31,8 +31,10 @@ __all__ = [
     "Decision",
     "Effect",
     "Effects",
+    "checked_states",
     "effect_class",
     "parse_states",
+    "unjudged",
 ]
 
 
@@ -107,16 +109,27 @@ def parse_states(text: str, like: bool = False) -> dict[str, str]:
         name, _, state = entry.partition("=")
         if name in states:
             raise OptionError(f"'{text}' names {name} twice; say once how it shall be")
+        states[name] = state
+    return checked_states(states, like)
+
+
+def checked_states(states: object, like: bool = False) -> dict[str, str]:
+    """States by name of the effect, as they are given; with ``like``, that of a sequence too.
+
+    Raises:
+        OptionError: no mapping, or an unknown effect or state.
+    """
+    if not isinstance(states, Mapping):
+        raise OptionError(f"effects are states by name, as in {{'gain': 'off'}}, and not {states!r}")
+    for name, state in states.items():
         if like and name == "like" and state:
-            states[name] = state
             continue
         if name not in NAMES or state not in STATES:
             raise OptionError(
-                f"'{entry}' is no choice of an effect; write NAME=auto, on or off with a NAME of "
+                f"'{name}={state}' is no choice of an effect; write NAME=auto, on or off with a NAME of "
                 f"{', '.join(NAMES)}"
             )
-        states[name] = state
-    return states
+    return dict(states)
 
 
 def _tuples(values):

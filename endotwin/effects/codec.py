@@ -42,7 +42,7 @@ class Codec(Effect):
     def evidence(cls, sequence: Sequence) -> tuple[Codec | None, str]:
         """Of JPEG files by their own tables, of others by what a JPEG's steps left in their pixels."""
         qualities = []
-        for file in sequence.color_files[:: max(len(sequence) // FILES, 1)]:
+        for file in (sequence.color_files[index] for index in sequence.spread(FILES)):
             quality = quality_of(file) if sequence.scale == 1 else None
             if quality is None:
                 return None, "rendered on request: the photos are no JPEG files and show no steps of one"

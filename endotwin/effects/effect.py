@@ -72,3 +72,8 @@ class Decision:
     fit_s: float = 0.0
     render_ms: float = 0.0
     memory_mb: float = 0.0
+
+
+def unjudged(state: str) -> Decision:
+    """Why an effect is off that was not judged, where its ``state`` was asked for."""
+    return Decision("off", "forced off" if state == "off" else "no time to judge")

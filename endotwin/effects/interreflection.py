@@ -13,8 +13,8 @@ from endotwin.effects.effect import Effect, parameter
 class Interreflection(Effect):
     """Diffuse light between patches of the surface (see ``radiosity``), from each frame's own light.
 
-    It adds b/π·E to a point's radiance, E the indirect irradiance there times ``strength``. That is 0 where
-    the photos show none of it.
+    It adds 2·L0·E·b to a point's radiance (see ``light.forward``), E the indirect irradiance there times
+    ``strength``. That is 0 where the photos show none of it.
     """
 
     name: ClassVar[str] = "interreflection"

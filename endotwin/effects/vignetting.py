@@ -31,7 +31,7 @@ class Vignetting(Effect):
 
 
 def squared_radius(camera: Camera, pixel: np.ndarray) -> np.ndarray:
-    """r² of row-major pixels [N], float32 [N]; 1 at the middle of the longer side of the image's border."""
+    """r² of row-major pixels [N], float32 [N]; 1 at the middle of the shorter side of the image's border."""
     half = max(camera.width, camera.height) / 2
     v, u = np.divmod(pixel, camera.width)
     x, y = (u - (camera.width - 1) / 2) / half, (v - (camera.height - 1) / 2) / half

@@ -438,8 +438,14 @@ def _to_be_scored(
     if twin is None:
         source = Source(str(sequence.path), sequence.format, sequence.scale, split=sequence.split)
         return sequence, source.heldout(len(sequence))
-    if sequence.path.resolve() == Path(twin.source.path):
+    if _folder(sequence.path) == _folder(Path(twin.source.path)):
         raise OptionError(
             f"{sequence.path} is the twin's own sequence; leave --sequence out, or name another"
         )
     return sequence, list(range(len(sequence)))
+
+
+def _folder(path: Path) -> Path:
+    """What a sequence is in, whether that or the ``transforms.json`` there was named."""
+    path = path.resolve()
+    return path.parent if path.name == "transforms.json" else path

@@ -41,7 +41,7 @@ def rendered_files(folder: Path, sequence: Sequence, frames: Indices[int]) -> di
         rules.append({index: by_number.get(_number(sequence.color_files[index])) for index in frames})
         rules.append({index: by_number.get(index) for index in frames})
     for rule in rules:
-        if all(rule.values()):
+        if all(rule.values()) and len(set(rule.values())) == len(rule):
             return rule
     if len(found) == len(frames):
         logger.warning(
@@ -49,7 +49,7 @@ def rendered_files(folder: Path, sequence: Sequence, frames: Indices[int]) -> di
             *(folder, found[0].name, sequence.color_files[frames[0]].name),
         )
         return dict(zip(frames, found, strict=True))
-    lost = next(index for index, file in rules[0].items() if file is None)
+    lost = next((index for index, file in rules[0].items() if file is None), frames[0])
     raise SequenceError(
         f"{folder} has {len(found)} pictures, but none of held-out frame {sequence.color_files[lost].name}; "
         f"render the {len(frames)} held-out frames and name each as its photo"

@@ -58,14 +58,12 @@ class Highlights:
 def judged(
     under: Callable[[Coat], Highlights], wanted: str, tried: bool = False
 ) -> tuple[Coat | None, Decision]:
-    """The coat that the highlights call for, or that is ``wanted`` (auto, on or off); and why.
+    """The coat that the highlights call for, or that is ``wanted`` (auto or on); and why.
 
     Args:
         under: the highlights, by the coat whose weight is sought. tried: a hint is enough, since all pixels
             are asked before it is kept.
     """
-    if wanted == "off":
-        return None, Decision("off", "forced off")
     began = time.perf_counter()
     search = _Search(under, under(Coat(0.0)))
     found = search.best()

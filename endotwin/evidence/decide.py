@@ -236,9 +236,11 @@ class _Trial:
         return Decided(effects, decisions, None if plain else kept.start)
 
     def _sets(self, names: Iterable[str]) -> list[frozenset[str]]:
-        """All sets of the effects ``names`` that are wanted, in which those that are forced are on."""
-        forced = frozenset(name for name in names if self.wanted(name) == "on")
-        free = [name for name in names if self.wanted(name) == "auto" and self._tellable(name, None)]
+        """All sets of the effects ``names`` that are wanted and can be told, in which those that are forced
+        are on."""
+        told = [name for name in names if self._tellable(name, None)]
+        forced = frozenset(name for name in told if self.wanted(name) == "on")
+        free = [name for name in told if self.wanted(name) == "auto"]
         return [forced.union(some) for count in range(len(free) + 1) for some in combinations(free, count)]
 
     def _fitted(self, names: frozenset[str]) -> Fitted:
@@ -364,6 +366,8 @@ class _Trial:
                 "vignetting": "with all light from the lens its profile says the same of every pixel",
                 "gain": "a single frame has no other to be brighter than",
             }.get(name, "the photos show too little")
+            if self.wanted(name) == "on":
+                reason = f"asked for, but {reason}"
         self._decisions[name] = Decision("on" if on else "off", reason, gain_db)
 
     def _effects(self, kept: Fitted) -> Effects:
@@ -378,8 +382,7 @@ class _Trial:
         if self._decisions["profile"].state == "on":
             effects.append(Profile(hypothesis.profile))
         if hypothesis.gain:
-            log_gain = kept.log_gain - kept.log_gain.mean()
-            effects.append(Gain(tuple(map(int, probe.frames)), tuple(map(float, log_gain))))
+            effects.append(Gain.centred(probe.frames, kept.log_gain))
         if hypothesis.vignetting:
             effects.append(Vignetting(k2=kept.vignetting))
         return Effects(effects)

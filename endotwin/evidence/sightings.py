@@ -10,7 +10,6 @@ import numpy as np
 from endotwin.effects.vignetting import squared_radius
 from endotwin.light.guides import visible_in_views
 from endotwin.pixels.start import trust
-from endotwin.surface.vectors import unit
 
 if TYPE_CHECKING:
     from endotwin.pixels.samples import Samples
@@ -50,14 +49,12 @@ class Sightings:
     @cached_property
     def points_mm(self) -> np.ndarray:
         """Surface points in the camera frame, float32 [N, 3]."""
-        local = self.local_points_mm - self.T_local_camera[self.frame, :3, 3]
-        return np.einsum("nba,nb->na", self.T_local_camera[self.frame, :3, :3], local).astype(np.float32)
+        return self.samples.points_mm
 
     @cached_property
     def normals(self) -> np.ndarray:
         """Unit normals in the camera frame, float32 [N, 3]."""
-        turned = np.einsum("nba,nb->na", self.T_local_camera[self.frame, :3, :3], self.local_normals)
-        return unit(turned.astype(np.float32))
+        return self.samples.normals(self.twin.surface)
 
     @cached_property
     def local_points_mm(self) -> np.ndarray:
@@ -102,6 +99,6 @@ class Sightings:
 
     @cached_property
     def vignetting_column(self) -> np.ndarray:
-        """r² of each pixel, r = 1 at the middle of the image's longer side, [N]. No r⁴ beside it: light of
+        """r² of each pixel, r = 1 at the middle of the image's shorter side, [N]. No r⁴ beside it: light of
         another exponent n is darker towards the rim in nearly the same way, and would lose its n to both."""
         return squared_radius(self.twin.camera, self.samples.pixel.numpy())

@@ -56,7 +56,7 @@ class Hues:
 
 
 def judged(without: Callable[[Tone], Hues], wanted: str) -> tuple[Tone | None, Decision]:
-    """The tone curve that the hues call for, or that is ``wanted`` (auto, on or off); and why.
+    """The tone curve that the hues call for, or that is ``wanted`` (auto or on); and why.
 
     Where light bounces they have to call for one beside a bounce of any strength, too: what the bounce
     lacks turns hues as well, most of all where its strength is found too far off. Beside the bounce that was
@@ -66,8 +66,6 @@ def judged(without: Callable[[Tone], Hues], wanted: str) -> tuple[Tone | None, D
     Args:
         without: the hues, by the curve that is taken off.
     """
-    if wanted == "off":
-        return None, Decision("off", "forced off")
     began = time.perf_counter()
     trials = _trials(without)
     tone, verdict = Tone(sum(curve.contrast for curve, _ in trials) / len(trials)), trials[0][1]

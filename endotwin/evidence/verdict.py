@@ -92,5 +92,5 @@ def compared(base: Halved, other: Halved, width: float) -> Verdict:
 def verdict_of(gained: np.ndarray, after: float) -> Verdict:
     """The verdict on losses that groups [G] lost by ``gained``, to ``after`` in all."""
     sigma = max(math.sqrt(float((gained**2).sum())), 1e-30)
-    ratio = (float(gained.sum()) + after) / max(after, 1e-30)
-    return Verdict(10 * math.log10(max(ratio, 1e-30)), float(gained.sum()) / sigma)
+    ratio = max(float(gained.sum()) + after, 1e-30) / max(after, 1e-30)
+    return Verdict(10 * math.log10(ratio), float(gained.sum()) / sigma)

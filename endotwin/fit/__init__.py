@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from endotwin.config import METHODS, STANDARD, FitConfig
-from endotwin.effects import RENDERED
+from endotwin.effects import RENDERED, checked_states
 from endotwin.errors import OptionError
 from endotwin.pixels.pace import Pace
 from endotwin.pixels.samples import Views
@@ -40,14 +40,14 @@ def fit(
         device: cpu, cuda, or auto for a GPU where there is one.
 
     Raises:
-        OptionError: an unknown method, an option that the method does not have, or an effect that no fit can
-            be told to find.
+        OptionError: an unknown method, effect or state, an option that the method does not have, or an effect
+            that no fit can be told to find.
         SequenceError: the photos cannot be read, or show nothing of the surface.
     """
     if config.method not in METHODS:
         raise OptionError(f"unknown method '{config.method}'; choose one of: {', '.join(METHODS)}")
-    place = device_of(device)
-    rendered = [name for name, state in (effects or {}).items() if name in RENDERED and state == "on"]
+    place, states = device_of(device), checked_states(effects or {})
+    rendered = [name for name, state in states.items() if name in RENDERED and state == "on"]
     if rendered:
         raise OptionError(
             f"{rendered[0]} cannot be forced on in a fit; ask for it with 'synth --effects {rendered[0]}=on'"
@@ -59,8 +59,8 @@ def fit(
             )
         from endotwin.fit.solve import fit_twin
 
-        return fit_twin(twin, Pace(config, progress), seed, effects or {}, price, place)
-    if effects:
+        return fit_twin(twin, Pace(config, progress), seed, states, price, place)
+    if states:
         raise OptionError(
             "effects belong to the method twin; endopbr is Han & Wu's model as published, without effects"
         )

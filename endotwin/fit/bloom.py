@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from endotwin.effects import Decision
+from endotwin.effects import Decision, unjudged
 from endotwin.effects.bloom import SATURATION, Bloom
 from endotwin.fit.beneath import decibels
 from endotwin.fit.film import LEAST_DB, Found, Report
@@ -38,7 +38,7 @@ def bloom(wet: Found, samples: Samples, wanted: str, report: Report) -> tuple[Bl
     not choose it judge by how much it explains of what is not saturated.
     """
     if wanted == "off":
-        return None, Decision("off", "forced off")
+        return None, unjudged(wanted)
     views = samples.views
     if len(views.frames) < 2 or not (samples.color >= CLIPPED).any():
         return None, Decision("off", "no photos with saturated highlights")

@@ -33,15 +33,15 @@ class Checkpoint:
         self._parameters = [each for group in optimizer.param_groups for each in group["params"]]
         self._written = time.perf_counter()
 
-    def resume(self) -> tuple[int, float]:
+    def resume(self, most: int) -> tuple[int, float]:
         """Steps done and seconds spent by the training that was stopped, its state restored; 0 and 0.0 if
-        none."""
+        there is none of at most so many steps."""
         if self._path is None or not self._path.exists():
             return 0, 0.0
         try:
             with safe_open(self._path, "pt") as file:
                 about = file.metadata()
-                if about["identity"] != self._identity:
+                if about["identity"] != self._identity or int(about["step"]) > most:
                     return 0, 0.0
                 kept = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
             self._restore(kept, int(about["step"]))
@@ -95,8 +95,11 @@ class Checkpoint:
 
 
 def identity(twin: Twin, *settings: object) -> str:
-    """A digest of the surface, the sequence and ``settings``: equal for the same training, and only then."""
-    digest = hashlib.sha256(json.dumps([asdict(twin.source), twin.camera.to_dict(), *settings]).encode())
+    """A digest of the surface, the photos' places and ``settings``: equal for the same training, and only
+    then."""
+    moved = twin.registration and asdict(twin.registration)
+    described = json.dumps([asdict(twin.source), twin.camera.to_dict(), moved, *settings])
+    digest = hashlib.sha256(described.encode())
     digest.update(twin.surface.vertices_mm.tobytes())
     digest.update(twin.surface.triangles.tobytes())
     return digest.hexdigest()

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
@@ -25,6 +25,7 @@ from endotwin.light import shading
 from endotwin.light.forward import Lit, Lobes, radiance
 from endotwin.light.incidence import COS_MIN
 from endotwin.pixels.start import ALBEDO_TOP
+from endotwin.run.ahead import ahead
 from endotwin.run.stopwatch import Stopwatch
 from endotwin.sequence import Frame, Sequence
 from endotwin.surface.vectors import unit
@@ -191,7 +192,7 @@ def fit_endopbr(
     per_epoch = math.ceil(len(frames) / IMAGES_A_STEP)
     steps = per_epoch * (epochs or (10**6 if budget_s else DEFAULT_EPOCHS))
     kept = Checkpoint(checkpoint, identity(twin, seed, LOG2_SLOTS, PIXELS_A_STEP, LEARNING_RATE), optimizer)
-    first, spent = kept.resume()
+    first, spent = kept.resume(steps)
     done, started = first, time.perf_counter() - spent
 
     photos = Photos(twin, sequence, device)
@@ -209,10 +210,9 @@ def fit_endopbr(
         picked = torch.from_numpy(picked).to(device)
         return {name: values[picked] for name, values in joined.items()}
 
-    with stopwatch.stage("train"), kept.told_when_stopped(), ThreadPoolExecutor(1) as reader:
-        ahead = reader.submit(batch, first)
-        for done in range(first + 1, steps + 1):
-            pixels, ahead = ahead.result(), reader.submit(batch, done)
+    batches = ahead(batch, range(first, steps))
+    with stopwatch.stage("train"), kept.told_when_stopped(), closing(batches):
+        for done, pixels in enumerate(batches, first + 1):
             if pixels is not None:
                 _step(field, shared, optimizer, pixels)
             if progress:

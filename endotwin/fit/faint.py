@@ -22,7 +22,7 @@ from endotwin.pixels.start import COS_MIN, PRIOR
 from endotwin.surface import Surface
 
 VIGNETTING = 0.8
-"""k2 of the shape: a lens that passes 45 % at the middle of the longer border."""
+"""k2 of the shape: a lens that passes 45 % at the middle of the shorter border."""
 
 ASIDE_MM = 6.0
 """Guides of the shapes end so far beside the lens, all to one side of it or all around."""

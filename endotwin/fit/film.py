@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from endotwin.cameras import Camera
-from endotwin.effects import Decision
+from endotwin.effects import Decision, unjudged
 from endotwin.effects.film import Film as FilmEffect
 from endotwin.fit.beneath import APART, Based, Model, kept_apart
 from endotwin.fit.by_pixels import by_pixels
@@ -58,7 +58,7 @@ class Found:
 def film(model: Model, samples: Samples, wanted: str, report: Report) -> Found:
     """The film that the photos call for, or that is ``wanted`` (auto, on or off); and why."""
     if wanted == "off":
-        return Found(Decision("off", "forced off"), model)
+        return Found(unjudged(wanted), model)
     began = time.perf_counter()
 
     def decided(state: str, reason: str, gain_db: float) -> Decision:

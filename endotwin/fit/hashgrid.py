@@ -163,8 +163,8 @@ class HashOperator:
         return to_torch(_to_scipy(self.forward_csr.cpu()).T).to(self.forward_csr.device)
 
     def __call__(self, table: Tensor) -> Tensor:
-        """Features [V, C] = A·table [R, C], differentiable; the gradient is Aᵀ·g."""
-        return _Apply.apply(table, self)
+        """Features [V, C] = A·table [R, C]."""
+        return self.forward_csr @ table
 
     def at(self, points_mm: np.ndarray, table: Tensor) -> Tensor:
         """Features [V, C] of ``table`` [R, C] at other points [V, 3]; a slot that has no row counts as 0."""
@@ -178,17 +178,6 @@ class HashOperator:
                 torch.from_numpy(slot), dense, mode="sum", per_sample_weights=torch.from_numpy(weight).float()
             )
         return features
-
-
-class _Apply(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx, table: Tensor, operator: HashOperator) -> Tensor:
-        ctx.operator = operator
-        return operator.forward_csr @ table
-
-    @staticmethod
-    def backward(ctx, gradient: Tensor) -> tuple[Tensor, None]:
-        return ctx.operator.adjoint_csr @ gradient.contiguous(), None
 
 
 def to_torch(matrix) -> Tensor:

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
-from endotwin.effects import Decision, Effects
+from endotwin.effects import Decision, Effects, unjudged
 from endotwin.effects.coat import Coat
 from endotwin.effects.tone import Tone
 from endotwin.evidence.coat import Highlights, best_coat
@@ -143,7 +143,9 @@ class LightStage:
         self._relighting, self._undetermined = relighting, start.undetermined
         self._bare: Best | None = None
         tone, decision = (None, None) if before is None else before.toned
-        self._decisions: dict[str, Decision] = {} if tone is None else {"tone": decision}
+        self._decisions = {name: unjudged(state) for name, state in wanted.items() if state == "off"}
+        if tone is not None:
+            self._decisions["tone"] = decision
         self._unit_mm = unit_mm(surface)
         self._goes_on = before is not None and before.state.shared.bounces and relighting.bounces
         if relighting.bounces and not self._goes_on and not pace.hurried:
@@ -170,8 +172,7 @@ class LightStage:
         toned = self._in_one_step() if self._relighting.bounces else None
         if not self._relighting.bounces:
             toned = self._in_turns()
-        hurried = Decision("off", "no time to judge")
-        decisions = dict.fromkeys(self._wanted, hurried) | self._decisions
+        decisions = {name: unjudged(state) for name, state in self._wanted.items()} | self._decisions
         return FoundLight(self._state, decisions, toned)
 
     def _in_turns(self) -> Toned | None:

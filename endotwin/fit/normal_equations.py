@@ -16,7 +16,7 @@ from torch import Tensor
 from endotwin.fit.frame_gains import FrameBorder, FramePattern, FrameSums
 from endotwin.fit.mesh_pattern import CORNER_PAIRS, MeshPattern, lumped, pairs_of
 from endotwin.fit.model import Globals, at_pixels, columns_of, linearise
-from endotwin.pixels.samples import Samples
+from endotwin.pixels.samples import CLIPPED, Samples
 from endotwin.pixels.start import DIFFUSE_SIN2
 from endotwin.run.ahead import on_all_cores
 
@@ -27,7 +27,6 @@ PLACES = ((0, -1, -1, 3), (-1, 1, -1, 4), (-1, -1, 2, 5), (3, 4, 5, 6))
 """Which of the sums of ``_Products.pairs`` are those of two channels: base colours do not meet."""
 
 CHUNK = 1 << 16
-CLIPPED = 255
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from endotwin.effects import Decision, Effect, Effects
+from endotwin.effects import Decision, Effect, Effects, unjudged
 from endotwin.errors import SequenceError
 from endotwin.evidence.decide import Decided, decide
 from endotwin.evidence.glints import Glints
@@ -34,7 +34,7 @@ from endotwin.fit.lighting import Relighting
 from endotwin.fit.prior import unusual
 from endotwin.fit.sparkle import sparkle
 from endotwin.fit.state import State
-from endotwin.fit.tilt import Tilter
+from endotwin.fit.tilt import Tilter, falling_on
 from endotwin.fit.unexplained import Remains, odd_photos_warning, residual_warning
 from endotwin.light.film import Film
 from endotwin.light.guides import AT_LENS
@@ -107,6 +107,7 @@ def fit_twin(
         state, normals, remains = fit.detail(lighted, samples)
         state = extended(state, surface, samples)
         twin = replace(twin, surface=replace(surface, normals=normals))
+        samples = falling_on(twin.surface, samples, relighting.effects)
     wet, beyond, why = fit.beyond(Model(twin, state, relighting, fit.caster), samples)
     if odd := unusual(state.shared):
         logger.warning(
@@ -341,12 +342,12 @@ class _Fit:
     def beyond(self, model: Model, samples: Samples) -> tuple[Found, list[Effect], dict[str, Decision]]:
         """What highlights show beyond the model, as far as there is time: the film, effects that are on, and
         why each is on or off."""
-        hurried = Decision("off", "no time to judge")
-        wet, glitter, glare = Found(hurried, model), (None, hurried), (None, hurried)
         pace, specular = self.pace, "specular" in model.relighting.effects
         film, sparkles, glares = (
             self.states.get(name, "auto") if specular else "off" for name in ("film", "sparkle", "bloom")
         )
+        wet = Found(unjudged(film), model)
+        glitter, glare = (None, unjudged(sparkles)), (None, unjudged(glares))
         with pace.stopwatch.stage("film"):
             if not pace.out_of_time():
                 wet = found_film(model, samples, film, pace.report)

@@ -22,7 +22,7 @@ from scipy.optimize import minimize
 from scipy.special import exp1, xlogy
 
 from endotwin.cameras.base import solid_angle
-from endotwin.effects import Decision
+from endotwin.effects import Decision, unjudged
 from endotwin.effects.sparkle import Sparkle
 from endotwin.fit.beneath import APART, GLINT, Model
 from endotwin.fit.film import Found as FoundFilm
@@ -75,7 +75,7 @@ Slopes = Callable[[np.ndarray, float], np.ndarray]
 def sparkle(wet: FoundFilm, views: Views, wanted: str, report: Report) -> tuple[Sparkle | None, Decision]:
     """The sparkles that ``views`` show beside a film, or that are ``wanted`` (auto, on or off); and why."""
     if wanted == "off":
-        return None, Decision("off", "forced off")
+        return None, unjudged(wanted)
     if wet.film is None and wanted == "auto":
         return None, Decision("off", "no film of fluid, whose facets they are")
     if len(views.frames) <= APART // 2:

@@ -25,6 +25,7 @@ from endotwin.light.incidence import COS_MIN
 from endotwin.pixels.samples import Samples
 from endotwin.robust import robust_std
 from endotwin.run.ahead import on_all_cores
+from endotwin.surface import Surface
 from endotwin.surface.vectors import dot, unit
 
 SPREAD_DEG = 0.5
@@ -135,6 +136,11 @@ class Tilter:
         ]
         axis, slope = _steepest(axes, slopes)
         return np.einsum("nb,nab->na", axis, rotation), slope, Residual.of(samples, predicted, width)
+
+
+def falling_on(surface: Surface, samples: Samples, effects: Effects) -> Samples:
+    """``samples`` whose guides' light falls on the ``surface``, of which normals alone are new."""
+    return _Direct.of(samples, samples.directions, effects).seen(samples.normals(surface))
 
 
 @dataclass(frozen=True)

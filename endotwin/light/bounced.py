@@ -236,8 +236,10 @@ class BouncedLight:
         level = here
         for (name, step), (moved, _) in zip(steps.items(), found, strict=True):
             slope = (moved - here) / step
-            slopes[name] = slope.mean(dim=1) if name in ("n", "q") else slope
-            level = level - about[name] * slopes[name].reshape(len(here), -1)
+            if name in ("n", "q"):
+                slope = slope.mean(dim=1, keepdim=True)
+            level = level - about[name] * slope
+            slopes[name] = slope.reshape(slopes[name].shape)
         return Bounce(level, *slopes.values(), gloss, surroundings)
 
     def _expected(

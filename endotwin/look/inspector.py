@@ -201,7 +201,8 @@ def _limits(values: np.ndarray) -> tuple[float, float]:
     """The range of all but the outermost 1% of ``values``, at least 0.02 wide."""
     low, high = np.percentile(values, [1, 99]) if len(values) else (0.0, 1.0)
     middle, half = (low + high) / 2, max((high - low) / 2, 0.01)
-    return float(max(middle - half, 0)), float(min(max(middle, half) + half, 1.0))
+    most = max(1.0, float(high))
+    return float(max(middle - half, 0)), float(min(max(middle, half) + half, most))
 
 
 class Stage:

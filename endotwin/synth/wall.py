@@ -11,6 +11,7 @@ from scipy.spatial import cKDTree
 
 from endotwin.cameras import Camera
 from endotwin.errors import OptionError, TwinError
+from endotwin.run.arguments import texts
 from endotwin.surface import Surface
 from endotwin.surface.casting import Caster
 from endotwin.surface.vectors import dot, unit
@@ -60,7 +61,7 @@ def one_by_one(
     """
     if not twin.fitted:
         raise TwinError("the twin has no materials yet; run 'endotwin fit' on it first")
-    asked = [(spec, *parse(spec)) for spec in ([specs] if isinstance(specs, str) else specs)]
+    asked = [(spec, *parse(spec)) for spec in texts("what lies on the wall", specs)]
     if sum(options.count for *_, options in asked) > room:
         raise OptionError(full)
     return [one for one in asked for _ in range(one[2].count)]

@@ -6,11 +6,10 @@ import shlex
 from dataclasses import dataclass, fields, is_dataclass, replace
 from pathlib import Path
 
-import yaml
-
 from endotwin.config import DEFAULT, SUFFIXES, Config, from_document, load_config, preset_names, to_yaml
 from endotwin.effects import NAMES, parse_states
 from endotwin.errors import OptionError
+from endotwin.run.yamltext import parsed
 
 LADDER = (
     "draft",
@@ -126,7 +125,7 @@ def rung(name: str) -> Rung:
 
 def _turned(base: str, knobs: list[str], name: str) -> Config:
     """The config ``base`` with ``knobs`` turned, for the rung ``name``."""
-    document = yaml.safe_load(to_yaml(load_config(base)))
+    document = parsed(to_yaml(load_config(base)))
     parts = [part for part in fields(Config) if is_dataclass(part.default_factory)]
     homes = {key.name: part.name for part in parts for key in fields(part.default_factory)}
     for knob in knobs:
@@ -136,5 +135,8 @@ def _turned(base: str, knobs: list[str], name: str) -> Config:
                 f"rung '{name}' turns '{key}', which is no knob; the knobs are {', '.join(homes)}, and the "
                 f"effects {', '.join(NAMES)}"
             )
-        document[homes[key]][key] = yaml.safe_load(value)
+        try:
+            document[homes[key]][key] = parsed(value)
+        except ValueError as error:
+            raise OptionError(f"rung '{name}': {value!r} is no value of '{key}' ({error})") from error
     return from_document(document, f"rung '{name}'")

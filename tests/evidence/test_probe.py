@@ -14,6 +14,7 @@ from endotwin.evidence.bounce import Surroundings
 from endotwin.evidence.light_map import LightMap, places_mm
 from endotwin.evidence.probe import LEAST_COS, Hypothesis, Probe, log_light
 from endotwin.evidence.sightings import Sightings
+from endotwin.evidence.verdict import verdict_of
 from endotwin.evidence.worth import LEAST
 from endotwin.pipeline import fuse_twin
 from endotwin.pixels.pace import Pace
@@ -147,3 +148,8 @@ def test_shadows_are_told_by_pixels_that_show_no_light(example):
     every = [np.repeat(x, 3, axis=0) for x in (np.arange(len(black)), example.vertex[hidden])]
     probe.dark = Sightings(black[torch.from_numpy(every[0])], every[1], example.twin, example.caster)
     assert probe.told_by_shadows(cast, uncast).gain_db > 0
+
+
+def test_where_nothing_is_judged_nothing_is_gained_or_lost():
+    verdict = verdict_of(np.zeros(5), 0.0)
+    assert (verdict.gain_db, verdict.sigmas) == (0.0, 0.0)

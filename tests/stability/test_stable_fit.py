@@ -9,6 +9,7 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -34,6 +35,18 @@ def tube(tmp_path_factory) -> Twin:
 def good(tube) -> Twin:
     """The tube, fitted from the closed form."""
     return endotwin.fit_twin(tube)
+
+
+@pytest.mark.parametrize("level", [255, 9])
+def test_effects_that_are_asked_for_and_cannot_be_told_are_off_with_a_reason(tmp_path, level):
+    folder = Tube().write(tmp_path / "tube", flight())
+    for photo in folder.glob("*_color.png"):
+        cv2.imwrite(str(photo), np.full_like(cv2.imread(str(photo)), level))
+    asked = dict.fromkeys(("interreflection", "gain", "coat", "vignetting"), "on")
+    twin = endotwin.fit_twin(endotwin.fuse_twin(folder), effects=asked, align="off")
+    assert np.isfinite(twin.materials.base_color).all()
+    bounce = twin.decisions["interreflection"]
+    assert (bounce.state, bounce.reason) == ("off", "asked for, but the photos show too little")
 
 
 def fitted_from(changed, tube: Twin, monkeypatch) -> Twin:

@@ -7,6 +7,8 @@ from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 
+import numpy as np
+
 from endotwin.errors import OptionError, SequenceError
 from endotwin.sequence.readers import c3vd, simcol, transforms, tum
 from endotwin.sequence.sequence import Sequence
@@ -58,6 +60,8 @@ def open_sequence(
     sequence = reader.read(path)
     sequence.check()
     if undistort is not None:
+        if np.shape(undistort) != (2,):
+            raise OptionError(f"a size to undistort to is a width and a height, and not {undistort!r}")
         if scale != 1:
             raise OptionError("a size to undistort to is the size of the images; leave the scale out")
         return Undistorted.of(sequence, *undistort)

@@ -12,6 +12,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from endotwin.errors import OptionError, TrajectoryError
+from endotwin.run.arguments import texts
 from endotwin.surface import Surface
 from endotwin.synth.motion.crossing import crossings
 from endotwin.synth.motion.kinds import KINDS, Breathing, Peristalsis
@@ -196,7 +197,7 @@ def parse_motion(specs: Iterable[str] | str, twin: Twin) -> Motion | None:
     Raises:
         OptionError: one is not understood. TrajectoryError: the twin has no centreline.
     """
-    specs = [specs] if isinstance(specs, str) else list(specs)
+    specs = texts("motion", specs)
     if not specs:
         return None
     kinds = [_parsed(spec) for spec in specs]

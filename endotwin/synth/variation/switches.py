@@ -8,7 +8,7 @@ from dataclasses import fields, replace
 
 import numpy as np
 
-from endotwin.effects import FITTED, NAMES, RENDERED, Effects, effect_class
+from endotwin.effects import FITTED, NAMES, RENDERED, Effects, checked_states, effect_class
 from endotwin.effects.offset import Offset
 from endotwin.effects.shadows import Shadows
 from endotwin.errors import OptionError
@@ -47,7 +47,7 @@ def equipped(twin: Twin, states: Mapping[str, str], trajectory: object) -> Twin:
         OptionError: an effect that only a fit can turn on or decide, or blur of a trajectory without a
             velocity. SequenceError: there is no such sequence.
     """
-    states = dict(states)
+    states = checked_states(states, like=True)
     like = states.pop("like", None)
     sequence = None if like is None else open_sequence(like)
     undecided = [name for name, state in states.items() if state == "auto"]
