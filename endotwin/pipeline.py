@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 from endotwin.cameras import read_camera
 from endotwin.config import STANDARD, FitConfig, FuseConfig
+from endotwin.effects import checked_states
 from endotwin.errors import OptionError, SequenceError, TwinError
 from endotwin.fit import fit
 from endotwin.render.price import priced
@@ -172,6 +173,7 @@ def fit_twin(
     if epochs is not None:
         check_whole("number of epochs", epochs, 1)
     check_whole("seed", seed)
+    effects = checked_states(effects or {})
     twin = _as_recorded(twin)
     config = replace(config, method=method or config.method, budget=budget_s or config.budget)
     undecided = "align" not in twin.record and config.method == "twin" and config.budget is None
