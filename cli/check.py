@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from endotwin.cli import console
 
+from endotwin.errors import OptionError
+
 if TYPE_CHECKING:
     from endotwin.check import Report
     from endotwin.synth import Proof
@@ -46,6 +48,8 @@ def check(
 
     Example: endotwin check examples/colon_small
     """
+    if labels and format is not None:
+        raise OptionError("a dataset says its own layout; leave --format or --labels out")
     with console.command("check", profile) as run:
         found = _proof(run, sequence) if labels else _report(run, sequence, format)
     if json:

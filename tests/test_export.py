@@ -263,7 +263,7 @@ def test_the_normal_map_turns_the_light_mesh_into_the_twins_normals(twin):
 
 
 @pytest.mark.slow
-def test_a_glb_carries_the_exact_light_and_its_spots_hang_on_the_camera(twin, document):
+def test_a_glb_carries_the_exact_light_and_its_spots_hang_on_the_camera(twin, document, files):
     exact = document["extras"]["endotwin"]
     assert document["extras"]["mm_per_unit"] == 1000
     assert [exact[name] for name in ("L0", "n", "q", "gamma", "f0")] == [
@@ -281,6 +281,9 @@ def test_a_glb_carries_the_exact_light_and_its_spots_hang_on_the_camera(twin, do
     (material,) = document["materials"]
     coat = material["extensions"]["KHR_materials_clearcoat"]
     assert coat["clearcoatFactor"] * 0.04 == pytest.approx(0.5 * shading.F0_WATER)
+    (library,) = files.glob("colon-*.mtl")
+    written = dict(line.split(" ", 1) for line in library.read_text().splitlines()[1:])
+    assert float(written["Pc"]) == pytest.approx(coat["clearcoatFactor"], rel=1e-4)
     specular = material["extensions"]["KHR_materials_specular"]
     assert specular["specularColorFactor"][0] * 0.04 == pytest.approx(twin.materials.f0)
 

@@ -77,6 +77,17 @@ def test_another_lens_reads_back_as_it_was_given(twin, trajectory, tmp_path, lay
     assert np.nanmax(np.abs(depth_mm - view.depth_mm)[there]) <= 0.51 * STEP_MM[layout]
 
 
+@pytest.mark.parametrize("camera", [None, FISHEYE], ids=["pinhole", "fisheye"])
+def test_instant_ngp_finds_depth_and_lens_under_its_own_names(twin, trajectory, tmp_path, camera):
+    synthesize(twin, trajectory, tmp_path / "d", layout="transforms", camera=camera)
+    content = json.loads((tmp_path / "d" / "transforms.json").read_text())
+    assert content["is_fisheye"] is (camera is not None)
+    frame = content["frames"][1]
+    assert (
+        frame["depth_path"] == frame["depth_file_path"] and (tmp_path / "d" / frame["depth_path"]).is_file()
+    )
+
+
 def test_a_lens_beyond_180_degrees_sees_as_far_as_its_own_rays(twin, trajectory, tmp_path):
     """The same poses through C3VD's lens: its depth is the tube's, as the pinhole's is."""
     camera = scenes.omni()

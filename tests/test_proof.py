@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -11,6 +12,7 @@ import pytest
 import tube_twin
 from command_line import invoke
 
+from endotwin.effects.tone import Tone
 from endotwin.errors import SequenceError
 from endotwin.sequence.images import read_color
 from endotwin.synth import LAYOUTS, Trajectory, parse_labels, prove, synthesize, with_fluids, with_polyps
@@ -64,6 +66,24 @@ def test_every_claim_holds_of_every_layout(layout, tmp_path):
 @pytest.mark.parametrize("label", parse_labels("all", polyps=True, fluids=True))
 def test_a_label_alone_proves_what_it_can_and_breaks_nothing(label, tmp_path):
     proof = prove(rendered(tmp_path / "d", labels=(label,), camera=tube_twin.CAMERA))
+    assert proof.holds, proof.broken
+
+
+def test_the_response_of_a_toned_twin_is_proved_too(tmp_path):
+    toned = replace(twin(), effects=twin().effects.including(Tone(0.4)))
+    synthesize(toned, trajectory(), tmp_path / "d", labels=("rgb", "rgb_linear"))
+    (row,) = (row for row in prove(tmp_path / "d").rows if row.claim == "response")
+    assert row.holds and row.pixels > 1000
+    document = json.loads((tmp_path / "d" / "dataset.json").read_text(encoding="utf-8"))
+    document["twin"]["effects"]["tone"]["contrast"] = 0.0
+    (tmp_path / "d" / "dataset.json").write_text(json.dumps(document), encoding="utf-8")
+    assert not prove(tmp_path / "d").holds
+
+
+def test_frames_far_apart_prove_their_labels(tmp_path):
+    apart = Trajectory(np.stack([tube_twin.pose(s) for s in (0.35, 0.6)]), np.arange(2) / 30, "two poses")
+    synthesize(twin(), apart, tmp_path / "d", labels=parse_labels("all", polyps=True, fluids=True))
+    proof = prove(tmp_path / "d")
     assert proof.holds, proof.broken
 
 

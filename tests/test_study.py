@@ -103,6 +103,8 @@ def test_a_stopped_study_goes_on_to_the_same_numbers_and_more_parts_go_on_from_t
     trained.clear()
     assert study("-o", tmp_path / "parted", "--parts", "ingredients", "--overwrite")[0] == 0
     assert set(trained) == {2 * len(TASTED)}
+    page = (tmp_path / "parted" / "depth.html").read_text(encoding="utf-8")
+    assert f"-o {RENDERED.name}-0" in page  # which an earlier run has rendered
     assert parted.splitlines()[:7] == (tmp_path / "parted" / "depth.csv").read_text().splitlines()[:7]
 
 
@@ -333,3 +335,11 @@ def test_no_difference_is_claimed_that_seeds_alone_would_make(real, rendered, bo
     }
     said = answer(Findings({"tests": ["cecum"], "seeds": 3}, list(HEADLINE), runs, []))
     assert f"{told[0]} on real ones" in said and f"both together are {told[1]} the better" in said
+
+
+def test_each_test_has_its_own_robustness_however_many_there_are(tmp_path):
+    (tmp_path / "results").mkdir()
+    for test in range(12):
+        (tmp_path / "results" / f"robustness.{test}.json").write_text(json.dumps({"test": test}))
+    found = Findings.read(tmp_path, [], 1, {"tests": [f"test {test}" for test in range(12)]})
+    assert [each["test"] for each in found.robustness] == list(range(12))

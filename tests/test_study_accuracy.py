@@ -49,6 +49,12 @@ def test_predictions_are_clipped_to_the_range_of_the_data():
     assert np.isfinite(accuracy(depth_mm, np.zeros((2, 2)))["rmse_log"])
 
 
+def test_depth_beyond_what_is_predicted_is_not_judged(depth_mm):
+    farther = np.where(np.arange(30) < 3, 1.5 * FARTHEST_MM, depth_mm)
+    within = np.where(np.arange(30) < 3, np.nan, depth_mm)
+    assert accuracy(farther, 1.1 * farther) == accuracy(within, 1.1 * farther)
+
+
 def test_an_image_without_depth_has_no_score():
     found = accuracy(np.full((2, 2), np.nan), np.ones((2, 2)))
     assert set(found) == set(METRICS) and np.isnan(list(found.values())).all()

@@ -145,7 +145,7 @@ def test_dataset_json_tells_what_was_done_and_no_path(twin, trajectory, tmp_path
     assert document["twin"]["sha256"] == fingerprint(twin) and "licence" in document["license_note"]
     assert 0 < document["coverage"]["valid"] <= 1
     assert str(tmp_path) not in text
-    edited, _ = edits.draw(1, 0)[0].edited(twin)
+    edited, _ = edits.draw(range(1), 0)[0].edited(twin)
     assert fingerprint(edited) != fingerprint(twin)
 
 

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from endotwin import pipeline
 from endotwin.errors import OptionError, SequenceError, TrajectoryError
-from endotwin.sequence.poses import write_c3vd_poses
+from endotwin.sequence.poses import write_c3vd_poses, write_tum_poses
 from endotwin.synth import parse_trajectory, synthesize
 from endotwin.synth.trajectories import Trajectory
 from endotwin.synth.trajectories.centerline import find_centerline
@@ -190,6 +190,9 @@ def test_a_pose_outside_the_lumen_is_refused_by_its_number_and_file(tube, tmp_pa
         ("ring:frames=3", "orbit:x=…,y=…"),
         ("orbit:frames=3", "give x, y and z"),
         ("orbit:u=3,v=3,radius=-1", "radius .*distance from the point"),
+        ("orbit:x=0,y=0,z=50,frames=0", "an orbit of 0 frames"),
+        ("orbit:x=0,y=0,z=50,frame=0,u=3,v=3", "two points"),
+        ("centerline:speed=0.00001", "raise its speed"),
         ("spline:", "no file"),
         ("jitter:colour=3", "translation"),
         ("jitter:frames=many", "number of poses"),
@@ -206,6 +209,15 @@ def test_a_pose_outside_the_lumen_is_refused_by_its_number_and_file(tube, tmp_pa
 def test_a_spec_that_is_not_understood_is_refused_with_what_is_allowed(tube, spec, allowed):
     with pytest.raises(TrajectoryError, match=allowed):
         parse_trajectory(spec, tube, seed=0)
+
+
+@pytest.mark.parametrize("times_s", [(0, 0, 0), (1, 2, 2), (3, 2, 1), (0, 1e-7, 2e-7)])
+def test_times_that_do_not_rise_are_told_and_not_taken(tube, tmp_path, caplog, times_s):
+    poses = np.stack([tube_twin.pose(s) for s in (0.2, 0.4, 0.6)])
+    write_tum_poses(tmp_path / "path.txt", poses, np.array(times_s, float))
+    trajectory = parse_trajectory(str(tmp_path / "path.txt"), tube, seed=0)
+    np.testing.assert_allclose(trajectory.timestamps_s * 30, [0, 1, 2])
+    assert "do not rise" in caplog.text
 
 
 def test_poses_of_a_file_that_break_a_limit_are_dropped_counted_and_keep_their_times(

@@ -13,7 +13,7 @@ from endotwin import pipeline
 from endotwin.effects.offset import Offset
 from endotwin.errors import OptionError
 from endotwin.sequence.poses import write_c3vd_poses
-from endotwin.synth import Trajectory, fixed, parse_light_edit, parse_material_edit, synthesize
+from endotwin.synth import Trajectory, fixed, make_job, parse_light_edit, parse_material_edit, synthesize
 from endotwin.synth.variation import Variation, read_variation
 
 RANGES = """
@@ -50,6 +50,22 @@ def ranges(twin, tmp_path):
     return read
 
 
+def test_what_is_drawn_for_a_pose_does_not_depend_on_those_that_are_dropped(ranges):
+    read = ranges("material: base_color.r*0.5..1.5")
+    whole, left = read.draw(range(6), 0), replace(along(4), numbers=np.array([0, 2, 3, 5]))
+    assert read.draw(left.originals, 0) == tuple(whole[k] for k in (0, 2, 3, 5))
+    assert read.draw(along(6).originals, 0) == whole
+
+
+def test_blur_that_is_drawn_needs_poses_that_follow_each_other(twin, ranges):
+    blurred = ranges("effects: {motion_blur: 0.9}")
+    for spec in ("jitter", "jitter:frames=8"):
+        with pytest.raises(OptionError, match="those of jitter do not"):
+            make_job(twin, replace(along(8), spec=spec), 0, ("rgb",), "c3vd", twin.camera, blurred)
+    path = replace(along(8), spec="jitter_path.txt")
+    assert make_job(twin, path, 0, ("rgb",), "c3vd", twin.camera, blurred).draws
+
+
 def along(count: int) -> Trajectory:
     poses = np.stack([tube_twin.pose(s) for s in np.linspace(0.2, 0.5, count)])
     return Trajectory(poses, np.arange(count) / 30, "along the axis")
@@ -57,9 +73,9 @@ def along(count: int) -> Trajectory:
 
 def test_draws_lie_in_their_ranges_change_with_the_clip_and_follow_the_seed(ranges):
     read = ranges(RANGES)
-    draws = read.draw(300, seed=4)
-    assert draws == read.draw(300, seed=4) and draws != read.draw(300, seed=5)
-    assert draws[:10] == read.draw(10, seed=4)
+    draws = read.draw(range(300), seed=4)
+    assert draws == read.draw(range(300), seed=4) and draws != read.draw(range(300), seed=5)
+    assert draws[:10] == read.draw(range(10), seed=4)
     assert all(draws[k] == draws[k // 3 * 3] for k in range(300)) and len(set(draws)) == 100
     intensity = np.array([draw.light[0].number for draw in draws[::3]])
     assert 0.5 <= intensity.min() < 0.56 and 1.44 < intensity.max() <= 1.5
@@ -69,7 +85,7 @@ def test_draws_lie_in_their_ranges_change_with_the_clip_and_follow_the_seed(rang
 
 def test_a_draw_edits_channels_regions_light_and_response(ranges, twin):
     read = ranges(RANGES)
-    draw = read.draw(1, seed=0)[0]
+    draw = read.draw(range(1), seed=0)[0]
     edited, exposure = draw.edited(twin, read.regions)
     inside = (twin.surface.vertices_mm + twin.surface.origin_mm)[:, 1] >= 0
     before, after = twin.materials, edited.materials
@@ -117,7 +133,7 @@ def test_the_file_tells_of_every_frame_what_its_picture_shows(twin, tmp_path):
 def test_edits_of_the_command_line_come_before_the_ranges(twin, tmp_path):
     (tmp_path / "vary.yaml").write_text("material: roughness*0.5..0.5")
     before = fixed([parse_material_edit("roughness=0.6")], [parse_light_edit("n=1")])
-    draw = read_variation(tmp_path / "vary.yaml", twin, before).draw(1, 0)[0]
+    draw = read_variation(tmp_path / "vary.yaml", twin, before).draw(range(1), 0)[0]
     edited, _ = draw.edited(twin)
     np.testing.assert_allclose(edited.materials.roughness, 0.3, atol=1e-6)
     assert edited.light.n == 1
@@ -139,14 +155,14 @@ def test_a_painted_region_takes_the_edit_by_its_weight(twin, tmp_path, kind):
         f"regions: [{{name: patch, vertices: mask.{kind}, material: [roughness=1]}}]"
     )
     read = read_variation(tmp_path / "vary.yaml", twin, fixed())
-    edited, _ = read.draw(1, 0)[0].edited(twin, read.regions)
+    edited, _ = read.draw(range(1), 0)[0].edited(twin, read.regions)
     expected = twin.materials.roughness * (1 - weight) + weight
     np.testing.assert_allclose(edited.materials.roughness, expected, atol=0.003)
 
 
 def test_effects_are_switched_by_their_chance_and_their_parameters_drawn(ranges, twin):
     read = ranges("effects: {coat: 0.25, noise: on}\nparameters: [coat.weight*0.5..2, noise.read_noise=9]")
-    draws = read.draw(400, 0)
+    draws = read.draw(range(400), 0)
     assert 0.18 < np.mean([dict(draw.effects)["coat"] for draw in draws]) < 0.32
     with_coat = next(draw for draw in draws if dict(draw.effects)["coat"])
     without = next(draw for draw in draws if not dict(draw.effects)["coat"])
@@ -155,12 +171,12 @@ def test_effects_are_switched_by_their_chance_and_their_parameters_drawn(ranges,
     assert edited.effects["noise"].read_noise == 0.2  # its upper bound
     assert list(without.edited(twin)[0].effects) == ["noise"]
     assert with_coat.to_dict()["effects"] == {"coat": "on", "noise": "on"}
-    off = ranges("effects: {coat: off}").draw(1, 0)[0]
+    off = ranges("effects: {coat: off}").draw(range(1), 0)[0]
     assert "coat" not in off.edited(edited)[0].effects
 
 
 def test_the_lights_offset_moves_every_guide(ranges, twin):
-    draw = ranges("light: [offset.x+2..2, offset.y*0.5]").draw(1, 0)[0]
+    draw = ranges("light: [offset.x+2..2, offset.y*0.5]").draw(range(1), 0)[0]
     beside, _ = draw.edited(twin)
     assert beside.effects.guides_mm == ((2.0, 0.0, 0.0),) and "shadows" in beside.effects
     two = replace(twin, effects=twin.effects.including(Offset(((1.0, 2.0, 0.0), (-3.0, 2.0, 0.0)))))

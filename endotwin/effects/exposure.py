@@ -44,6 +44,9 @@ GRID = 64
 
 INSTANT = 1e-3
 
+SAME_INTERVAL = 0.01
+"""Frames whose intervals differ by a smaller share follow each other evenly."""
+
 
 @dataclass(frozen=True)
 class Shot:
@@ -74,10 +77,7 @@ class Shot:
     @cached_property
     def _screw(self) -> np.ndarray:
         """log(T(0)⁻¹·T(1)), [6]; zeros for equal poses."""
-        if np.array_equal(self.T_world_camera, self.T_world_next):
-            return np.zeros(6)
-        motion = np.linalg.inv(self.T_world_camera) @ self.T_world_next
-        return RigidTransform.from_matrix(motion).as_exp_coords()
+        return _screw(self.T_world_camera, self.T_world_next)
 
     @cached_property
     def speed_px(self) -> float:
@@ -138,11 +138,29 @@ def expose(film: Film, shot: Shot, effects: Ordered[ExposureEffect] = ()) -> Ten
     return total / poses
 
 
-def following(T_world_camera: np.ndarray) -> np.ndarray:
-    """The pose one frame later of each pose [N, 4, 4] of a trajectory; the last one goes on as before."""
+def following(T_world_camera: np.ndarray, times_s: np.ndarray | None = None) -> np.ndarray:
+    """The pose one frame later of each pose [N, 4, 4] of a trajectory; the last one goes on as before.
+
+    ``times_s`` [N], where poses do not follow each other at the interval that most do; between two the camera
+    moves on one screw.
+    """
     T = np.asarray(T_world_camera, np.float64)
-    last = T[-1:] @ np.linalg.inv(T[-2:-1]) @ T[-1:] if len(T) > 1 else T[-1:]
-    return np.concatenate([T[1:], last])
+    if len(T) < 2:
+        return T.copy()
+    later = T[1:].copy()
+    if times_s is not None:
+        steps_s = np.diff(times_s)
+        share = np.median(steps_s) / steps_s
+        for k in np.flatnonzero(np.abs(share - 1) > SAME_INTERVAL):
+            later[k] = T[k] @ RigidTransform.from_exp_coords(share[k] * _screw(T[k], T[k + 1])).as_matrix()
+    return np.concatenate([later, T[-1:] @ np.linalg.inv(T[-2:-1]) @ later[-1:]])
+
+
+def _screw(T: np.ndarray, T_next: np.ndarray) -> np.ndarray:
+    """log(T⁻¹·T_next), [6]; zeros for equal poses [4, 4]."""
+    if np.array_equal(T, T_next):
+        return np.zeros(6)
+    return RigidTransform.from_matrix(np.linalg.inv(T) @ T_next).as_exp_coords()
 
 
 def _sampling(shot: Shot) -> tuple[int, float]:

@@ -98,6 +98,11 @@ class Appearance:
         power = f"x^{self.gamma:.6g}"
         return f"C + {self.tone:.6g}*(3*C^2 - 2*C^3 - C) of C = {power}" if self.tone else power
 
+    @property
+    def coat_weight(self) -> float:
+        """Of a clear coat of a dielectric's reflectance, as formats have it, in [0, 1]."""
+        return min(self.coat_f0 / shading.F0_DIELECTRIC, 1.0)
+
     def to_dict(self) -> dict:
         """All of it as plain values, with what the names mean."""
         return {

@@ -130,8 +130,8 @@ def _material(parts: _Parts, look: Appearance, mesh: Textured) -> dict:
     if look.film_f0:
         extensions[COAT] = _film(look, mesh, pictures)
     elif look.coat_f0:
-        weight = min(look.coat_f0 / F0_DIELECTRIC, 1.0)
-        extensions[COAT] = {"clearcoatFactor": weight, "clearcoatRoughnessFactor": look.coat_roughness}
+        weight, roughness = look.coat_weight, look.coat_roughness
+        extensions[COAT] = {"clearcoatFactor": weight, "clearcoatRoughnessFactor": roughness}
     images = [
         {"name": name, "mimeType": "image/png", "bufferView": parts.view(picture)}
         for name, picture in pictures.items()

@@ -27,7 +27,7 @@ map_Kd {stem}_base_color.png
 Pr 1
 map_Pr {stem}_roughness.png
 Pm 0
-Pc {coat_f0:.6g}
+Pc {coat_weight:.6g}
 Pcr {coat_roughness:.6g}
 norm {stem}_normal.png
 """
@@ -43,7 +43,8 @@ def write_obj(twin: Twin, path: Path, overwrite: bool = False) -> None:
         "roughness": png(mesh.roughness),
         "normal": png(mesh.normal / 2 + 0.5),
     }
-    material = MATERIAL.format(stem="{stem}", displayed=look.displayed, **look.to_dict())
+    told = {"displayed": look.displayed, "coat_weight": look.coat_weight, **look.to_dict()}
+    material = MATERIAL.format(stem="{stem}", **told)
     checksum = hashlib.sha256(b"".join([material.encode(), *pictures.values()])).hexdigest()[:16]
     stem = f"{path.stem}-{checksum}"
     parts = {f"{stem}_{part}.png": picture for part, picture in pictures.items()}

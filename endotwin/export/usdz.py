@@ -16,7 +16,7 @@ from endotwin.errors import OptionError
 from endotwin.export.appearance import Appearance
 from endotwin.export.glb import FAR_M, M_PER_MM, NEAR_M, PATH_FPS, TURN, path_in_m, png, srgb
 from endotwin.export.textured import Textured, textured
-from endotwin.light.shading import F0_DIELECTRIC, ROUGHNESS_MIN
+from endotwin.light.shading import ROUGHNESS_MIN
 from endotwin.run.output import whole_file
 from endotwin.synth.trajectories.recorded import path_or_flight
 from endotwin.twin import Twin
@@ -97,7 +97,7 @@ def _material(stage: Usd.Stage, look: Appearance) -> UsdShade.Material:
     surface.CreateIdAttr("UsdPreviewSurface")
     root = math.sqrt(look.f0)
     values = {"metallic": 0.0, "ior": (1 + root) / (1 - root)}
-    values |= {"clearcoat": min(look.coat_f0 / F0_DIELECTRIC, 1.0), "clearcoatRoughness": look.coat_roughness}
+    values |= {"clearcoat": look.coat_weight, "clearcoatRoughness": look.coat_roughness}
     for name, value in values.items():
         surface.CreateInput(name, Sdf.ValueTypeNames.Float).Set(value)
     kinds = Sdf.ValueTypeNames

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import re
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -18,10 +19,13 @@ RIGID_TOLERANCE = 1e-3
 LARGEST = 1e12
 """Beyond it no number of a pose or a time makes sense, and float64 is coarser than a micrometre."""
 FRAMES_PER_SECOND = 30.0  # assumed where a format has no times
+TIME_DIGITS = 6  # of seconds, in names of files
 MM_PER_UNIT = {"m": 1000.0, "mm": 1.0}
 AXES_OPENGL_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 C3VD_ROW = "16 comma-separated numbers, the camera-to-world matrix column by column"
 TUM_ROW = "'timestamp tx ty tz qx qy qz qw'"
+
+logger = logging.getLogger("endotwin")
 
 _AS_WRITTEN = ContextVar("as_written", default=False)
 
@@ -42,7 +46,7 @@ def read_poses(path: Path | str) -> tuple[np.ndarray, np.ndarray]:
 
     Returns:
         ``T_world_camera`` float64 [N, 4, 4] in mm (TUM's unit is the metre) and timestamps in seconds [N],
-        counted at ``FRAMES_PER_SECOND`` where the file has none.
+        counted at ``FRAMES_PER_SECOND`` where the file has none that rise.
 
     Raises:
         TrajectoryError: the file is none of these, has no poses, or one that is not rigid.
@@ -53,7 +57,10 @@ def read_poses(path: Path | str) -> tuple[np.ndarray, np.ndarray]:
         if first.startswith("{"):
             T_world_camera, _ = read_transforms_poses(path)
         elif len(_words(first)) == 8:
-            return read_tum_poses(path)
+            T_world_camera, times_s = read_tum_poses(path)
+            if (np.diff(times_s.round(TIME_DIGITS)) > 0).all():
+                return T_world_camera, times_s
+            logger.warning("the times of %s do not rise: 30 poses a second are assumed", path)
         else:
             T_world_camera = read_c3vd_poses(path)
     except SequenceError as error:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 NEAREST_MM, FARTHEST_MM = 0.1, 100.0
-"""What predictions are clipped to; pixels beyond C3VD's 100 mm have no depth."""
+"""What predictions are clipped to; depth beyond C3VD's 100 mm counts as none."""
 
 METRICS = ("abs_rel", "sq_rel", "rmse", "rmse_log", "d1", "d2", "d3")
 NAMES = dict(
@@ -45,8 +45,8 @@ def accuracy(depth_mm: np.ndarray, predicted_mm: np.ndarray) -> dict[str, float]
 
 
 def valid(depth_mm: np.ndarray, predicted_mm: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Depth and clipped prediction, float64 [P], of the pixels that have depth."""
-    has = np.isfinite(depth_mm) & (depth_mm > 0)
+    """Depth and clipped prediction, float64 [P], of the pixels that have depth, within FARTHEST_MM."""
+    has = (depth_mm > 0) & (depth_mm <= FARTHEST_MM)
     return (
         depth_mm[has].astype(np.float64),
         np.clip(predicted_mm[has].astype(np.float64), NEAREST_MM, FARTHEST_MM),

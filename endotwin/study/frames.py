@@ -86,7 +86,7 @@ def lit_pixels(sequence: Sequence, size: Size) -> np.ndarray:
 
 
 def of_dataset(
-    folder: Path, size: Size, lit: np.ndarray, codec: tuple[int, int] | None = None
+    folder: Path, size: Size, lit: np.ndarray, codec: tuple[int, int] | None = None, seed: int = 0
 ) -> Iterator[Frame]:
     """Photo and depth of each frame of a dataset in the layout ``webdataset``, with rgb, depth and mask.
 
@@ -94,7 +94,7 @@ def of_dataset(
 
     Args:
         lit: bool [H, W] at ``size``; the rest becomes black, and has no depth.
-        codec: least and greatest quality of a JPEG that each photo has been.
+        codec: least and greatest quality of a JPEG that each photo has been, drawn by ``seed``.
     """
     import webdataset
 
@@ -102,7 +102,7 @@ def of_dataset(
     for index, frame in enumerate(webdataset.WebDataset(shards, shardshuffle=False)):
         color = pixels(frame["rgb.png"])
         if codec:
-            quality = np.random.default_rng(index).integers(codec[0], codec[1] + 1)
+            quality = np.random.default_rng((seed, index)).integers(codec[0], codec[1] + 1)
             color = as_jpeg(color, int(quality))
         depth_mm = decode_depth(frame["depth.tiff"])
         known = np.isfinite(depth_mm) & (pixels(frame["mask.png"]) >= MASK_UNSEEN)

@@ -53,7 +53,8 @@ class Findings:
         }
         runs = {name: [result["scores"] for result in each] for name, each in found.items()}
         seconds = sum(result["seconds"] for each in found.values() for result in each)
-        robustness = [_read(file) for file in sorted(results.glob("robustness.*.json"))]
+        files = [results / f"robustness.{test}.json" for test in range(len(facts["tests"]))]
+        robustness = [_read(file) for file in files if file.exists()]
         facts = {**facts, "seconds": seconds}
         return cls(facts, arms, runs, robustness)
 
@@ -165,11 +166,9 @@ def _protocol(facts: dict) -> str:
 def commands(work: Path) -> list[str]:
     """What rendered each dataset, as a user would type it."""
     lines = []
-    for folder in sorted((work / "datasets").glob("*/dataset.json")):
-        content = _read(folder)
-        name = folder.parent.name
+    for file in sorted((work / "recipes").glob("*.command.json")):
+        name, asked = file.name.removesuffix(".command.json"), _read(file)
         recipe = name.rpartition("-")[0]
-        asked = content["command"]
         lines.append(
             f"endotwin synth TWIN --trajectory {asked['trajectory']} --vary recipes/{recipe}.yaml --camera "
             f"recipes/{name}.camera.json --labels {asked['labels']} --layout {asked['layout']} --seed "

@@ -39,7 +39,7 @@ from endotwin.study.frames import Frames, kept, lit_pixels, of_dataset, of_seque
 from endotwin.study.leak import require_unseen
 from endotwin.study.networks import found, network
 from endotwin.study.recipe import OTHER_LENSES, RENDERED, TRAJECTORY, Recipe
-from endotwin.study.train import LOSSES, Course, train
+from endotwin.study.train import LOSSES, Course, finished, train
 from endotwin.tradeoff.run import PARTIAL, machine
 from endotwin.twin import Twin
 
@@ -234,14 +234,15 @@ class _Experiment:
         parts, count = [], 0
         for number, ((twin, lens, lit, _), wanted) in enumerate(zip(lenses, counts, strict=True)):
             if wanted:
-                data = self._dataset(recipe, f"{recipe.name}-{number}", twin, lens, wanted)
-                parts.append(of_dataset(data, self.size, lit, recipe.codec))
+                data = self._dataset(recipe, number, twin, lens, wanted)
+                parts.append(of_dataset(data, self.size, lit, recipe.codec, number))
                 count += _read(data / DATASET)["frames"]
         folder = self.work / "frames" / recipe.name
         return kept(chain(*parts), count, self.size, folder, {"source": recipe.name, "size": list(self.size)})
 
-    def _dataset(self, recipe: Recipe, name: str, twin: Twin, lens: Camera, count: int) -> Path:
-        """The dataset ``name`` of so many poses, rendered unless it is there."""
+    def _dataset(self, recipe: Recipe, number: int, twin: Twin, lens: Camera, count: int) -> Path:
+        """The dataset of that ``number`` of a recipe, of so many poses, rendered unless it is there."""
+        name = f"{recipe.name}-{number}"
         data, lens_file = self.work / "datasets" / name, self.work / "recipes" / f"{name}.camera.json"
         if not data.exists():
             _keep(lens.to_dict(), lens_file)
@@ -253,9 +254,11 @@ class _Experiment:
                 camera=lens_file,
                 labels="rgb,depth,mask",
                 layout="webdataset",
+                seed=number,
                 workers=0,
                 progress=lambda _, done, total: self.progress(f"render {recipe.name}", done, total),
             )
+        _keep(_read(data / DATASET)["command"], self.work / "recipes" / f"{name}.command.json")
         return data
 
     def _lenses(self, twin: Twin, recipe: Recipe) -> list[tuple[Camera, np.ndarray, float]]:
@@ -302,7 +305,8 @@ class _Experiment:
         course = Course(self.steps, self.batch, self.rate, self.plan.loss, seed)
         checkpoint = self.work / "networks" / f"{arm.name}.{seed}.pt"
         first = network(self.network, seed)
-        return train(first, self._pools_of(arm), course, checkpoint, progress, self.device)
+        pools = [] if finished(checkpoint, course) else self._pools_of(arm)
+        return train(first, pools, course, checkpoint, progress, self.device)
 
     def _pools_of(self, arm: Arm) -> list[Frames]:
         """What an arm is trained on."""

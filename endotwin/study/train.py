@@ -14,6 +14,7 @@ from torch.nn import functional
 from torch.utils.data import ConcatDataset
 
 from endotwin.run.output import whole_file
+from endotwin.study.accuracy import FARTHEST_MM
 from endotwin.study.frames import Frames
 
 HUBER_MM = 5.0
@@ -78,7 +79,7 @@ def train(
         for group in optimizer.param_groups:
             group["lr"] = course.rate * 0.5 * (1 + math.cos(math.pi * step / course.steps))
         color, depth_mm = (each.to(device) for each in batch(pools, course, step))
-        has = torch.isfinite(depth_mm) & (depth_mm > 0)
+        has = (depth_mm > 0) & (depth_mm <= FARTHEST_MM)
         if has.any():
             optimizer.zero_grad()
             LOSSES[course.loss](network(color), depth_mm, has).backward()
@@ -100,12 +101,24 @@ def trained_weights(network: nn.Module) -> dict[str, torch.Tensor]:
     return {name: each.detach() for name, each in network.named_parameters() if each.requires_grad}
 
 
+def finished(checkpoint: Path, course: Course) -> bool:
+    """Whether a training has come to its end, and needs no frames."""
+    state = _saved(checkpoint, course)
+    return state is not None and state["step"] == course.steps
+
+
+def _saved(checkpoint: Path, course: Course) -> dict | None:
+    """What is kept of a training of the same course."""
+    if not checkpoint.exists():
+        return None
+    state = torch.load(checkpoint, map_location="cpu", weights_only=True)
+    return state if state["course"] == asdict(course) else None
+
+
 def _resumed(network: nn.Module, optimizer: torch.optim.Optimizer, checkpoint: Path, course: Course) -> int:
     """The step to go on from."""
-    if not checkpoint.exists():
-        return 0
-    state = torch.load(checkpoint, map_location="cpu", weights_only=True)
-    if state["course"] != asdict(course):
+    state = _saved(checkpoint, course)
+    if state is None:
         return 0
     network.load_state_dict(state["weights"], strict=False)
     if "optimizer" in state:

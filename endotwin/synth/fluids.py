@@ -101,7 +101,7 @@ def with_fluids(
     full = f"{MOST_FLUIDS} patches of fluid lie on a twin at most; ask for fewer"
     each = one_by_one(twin, specs, parse_fluid, MOST_FLUIDS - len(twin.fluids), full)
     wall, wetted = Wall(twin, trajectory, camera or twin.camera, Caster(twin.surface)), Wetted(twin)
-    for k, one in enumerate(each):
+    for k, one in enumerate(each, len(twin.fluids)):
         _spill(wetted, wall, one[2].down(trajectory), *one, Stream.FLUID.generator(seed, k))
     return wetted.finished(), wetted.weights
 

@@ -122,7 +122,7 @@ class Labeller:
             "polyp": numbered((each.triangles for each in twin.polyps), count),
             "fluid": covered((each.triangles for each in twin.fluids), count),
         }
-        self._T_world_next = following(job.trajectory.T_world_camera)
+        self._T_world_next = following(job.trajectory.T_world_camera, job.trajectory.timestamps_s)
         self._shaded: tuple[object, Renderer, Renderer | None] | None = None
 
     def frame(self, index: int, clip: Clip | None = None) -> dict[str, np.ndarray]:
@@ -137,7 +137,7 @@ class Labeller:
         if (PHOTOS | {"specular"}) & set(job.labels):
             view = renderer.view(T_world_camera, hits=self._sights[index].hits)
         if PHOTOS & set(job.labels):
-            generator = Stream.SENSOR.generator(job.document["seed"], index)
+            generator = Stream.SENSOR.generator(job.document["seed"], int(job.trajectory.originals[index]))
             color, radiance = photographed(
                 renderer, view, T_world_camera, self._T_world_next[index], generator, clip
             )

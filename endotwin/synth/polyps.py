@@ -63,7 +63,9 @@ def with_polyps(
     full = f"a twin holds {MOST_POLYPS} polyps at most; ask for fewer"
     each = one_by_one(twin, specs, parse_polyp, MOST_POLYPS - len(twin.polyps), full)
     garden = _Garden(twin, trajectory, camera or twin.camera)
-    seedlings = [garden.seedling(*one, Stream.POLYP.generator(seed, k)) for k, one in enumerate(each)]
+    seedlings = [
+        garden.seedling(*one, Stream.POLYP.generator(seed, k)) for k, one in enumerate(each, len(twin.polyps))
+    ]
     return grown(twin, seedlings)
 
 

@@ -35,7 +35,7 @@ def _tables(folder: Path, job: Job) -> None:
     write_lines(folder / "SavedPosition_S1.txt", [numbers(row) for row in positions_cm])
     write_lines(folder / "SavedRotationQuaternion_S1.txt", [numbers(row) for row in quaternions])
     write_camera(folder / FRAMES / "camera.json", job.camera)
-    if isinstance(job.camera, Pinhole):
+    if isinstance(job.camera, Pinhole) and not job.camera.distortion.any():
         K = job.camera.matrix + np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
         write_lines(folder / "cam.txt", [numbers(row) for row in K])
 
@@ -49,7 +49,7 @@ LAYOUT = Layout(
         "camera to "
         "world, left-handed, y up: mirror y in the world and in the camera for OpenCV's axes",
         "camera": f"{FRAMES}/{CAMERA_WORDS}; cam.txt: the matrix K, principal point counted from the "
-        f"image's edge",
+        f"image's edge, where there is no distortion",
     },
     {
         "depth": depth_png(

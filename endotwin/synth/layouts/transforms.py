@@ -12,6 +12,8 @@ from endotwin.synth.job import Job
 from endotwin.synth.layouts.layout import Layout, frame_name, needs
 
 FOLDERS = {"rgb": "images"}
+PATHS = {"depth": ("depth_file_path", "depth_path"), "mask": ("mask_path",)}
+"""What frames call their images: nerfstudio, and instant-ngp, which knows no masks."""
 LEVELS_PER_MM = 500
 DEPTH_SCALE = 1 / LEVELS_PER_MM / MM_PER_UNIT["m"]
 
@@ -42,12 +44,13 @@ def _tables(folder: Path, job: Job) -> None:
     for index, pose in enumerate(job.trajectory.T_world_camera @ AXES_OPENGL_OPENCV):
         pose[:3, 3] /= MM_PER_UNIT["m"]
         frame = {"file_path": LAYOUT.file(job, index, "rgb")}
-        for image, key in (("depth", "depth_file_path"), ("mask", "mask_path")):
+        for image, keys in PATHS.items():
             if image in job.images:
-                frame[key] = LAYOUT.file(job, index, image)
+                frame |= dict.fromkeys(keys, LAYOUT.file(job, index, image))
         frames.append({**frame, "transform_matrix": pose.tolist()})
     content = {
         "camera_model": "OPENCV" if isinstance(camera, Pinhole) else "OPENCV_FISHEYE",
+        "is_fisheye": isinstance(camera, Fisheye),
         "w": camera.width,
         "h": camera.height,
         "fl_x": camera.fx,
@@ -70,9 +73,10 @@ LAYOUT = Layout(
         "poses": "transforms.json: camera-to-world matrices, positions in metres, camera axes x right, y "
         "up, z "
         "backward (OpenGL); nerfstudio needs --depth-unit-scale-factor 2e-6, instant-ngp reads "
-        "integer_depth_scale; mask_path: pixels that are 0 are left out; principal point counted from the "
-        "image's edge",
-        "camera": "transforms.json: OPENCV or OPENCV_FISHEYE intrinsics in pixels",
+        "integer_depth_scale and depth_path; mask_path, which instant-ngp passes over: pixels that are 0 are "
+        "left out; principal point counted from the image's edge",
+        "camera": "transforms.json: OPENCV or OPENCV_FISHEYE intrinsics in pixels; instant-ngp passes over a "
+        "pinhole's k3",
     },
     {"depth": depth_png(LEVELS_PER_MM, f"16-bit z-depth, raw / {LEVELS_PER_MM} mm; 0: none")},
     _refusal,

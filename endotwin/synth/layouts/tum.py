@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from endotwin.cameras import Pinhole, write_camera
-from endotwin.sequence.poses import MM_PER_UNIT
+from endotwin.sequence.poses import MM_PER_UNIT, TIME_DIGITS
 from endotwin.synth.encodings import depth_png
 from endotwin.synth.job import Job
 from endotwin.synth.layouts.layout import CAMERA_WORDS, Layout, needs, numbers, write_lines
@@ -17,7 +17,7 @@ LEVELS_PER_MM = 5
 
 
 def _time(job: Job, index: int) -> str:
-    return f"{job.trajectory.timestamps_s[index]:.6f}"
+    return f"{job.trajectory.timestamps_s[index]:.{TIME_DIGITS}f}"
 
 
 def _place(job: Job, index: int, image: str, suffix: str) -> str:

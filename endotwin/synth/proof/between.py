@@ -15,7 +15,7 @@ BEHIND_MM = 0.5
 """Surface that lies so far behind another, and 1 % of its distance, is not the same."""
 
 SLOPE = 0.25
-"""Share of what four pixels differ by, by which curved surface between them is off their interpolation."""
+"""Share of what four pixels differ by, by which what lies between them is off their interpolation."""
 
 MATERIALS = ("albedo", "roughness", "metallic")
 
@@ -62,7 +62,8 @@ def _depths(other: Frame, there: Landing, hidden: np.ndarray | None) -> Iterator
         hidden = hidden[about.chosen] == HIDDEN
         seen = smooth & ~hidden
         behind = distance_mm > farthest + slack_mm + BEHIND_MM
-        wrong = np.where(hidden, smooth & (off_mm < 0), behind)
+        even = smooth & (farthest - nearest < BEHIND_MM)
+        wrong = np.where(hidden, even & (off_mm < 0), behind)
         yield "hidden", wrong[hidden | behind].astype(float)
     yield "warp", 100 * (np.maximum(off_mm, 0) / lies_mm)[seen]
     if other.written.has("occlusion"):
@@ -96,8 +97,9 @@ def _materials(one: Frame, other: Frame, there: Landing) -> Iterator[Judged]:
     about = _same_tissue(other, there)
     for name in filter(one.written.has, MATERIALS):
         here = one.image(name).reshape(len(one.distance_mm.ravel()), -1)[there.chosen[about.chosen]]
-        off = np.abs(about.mean(other.image(name)).reshape(here.shape) - here)
-        yield "materials", off.max(axis=1)
+        there_too = other.image(name).reshape(*other.distance_mm.shape, -1)
+        off = np.abs(about.mean(there_too) - here) - SLOPE * np.ptp(about.values(there_too), axis=1)
+        yield "materials", np.maximum(off, 0).max(axis=1)
 
 
 def _cycle(one: Frame, other: Frame, name: str, flow_px: np.ndarray, back_px: np.ndarray) -> np.ndarray:
@@ -107,6 +109,6 @@ def _cycle(one: Frame, other: Frame, name: str, flow_px: np.ndarray, back_px: np
     uv = np.stack([chosen % flow_px.shape[1], chosen // flow_px.shape[1]], axis=1) + out
     about = sampled(other, uv)
     about = about.where(about.values(other.smooth).all(axis=1))
-    back = about.mean(back_px)
-    off = np.linalg.norm(out[about.chosen] + back, axis=1)
-    return off[np.isfinite(off)]
+    back, differ = about.mean(back_px), np.ptp(about.values(back_px), axis=1)
+    off = np.linalg.norm(out[about.chosen] + back, axis=1) - SLOPE * np.linalg.norm(differ, axis=1)
+    return np.maximum(off[np.isfinite(off)], 0)

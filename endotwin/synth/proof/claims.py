@@ -64,7 +64,8 @@ class Row:
 
     @property
     def holds(self) -> bool:
-        return self.beyond <= CLAIMS[self.claim].stray
+        stray = CLAIMS[self.claim].stray
+        return self.beyond * self.pixels <= max(stray * self.pixels, stray > 0)
 
     def cells(self) -> tuple[str, ...]:
         """What is claimed, how many pixels were judged, median, one in a thousand, limit, share beyond,

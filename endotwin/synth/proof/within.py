@@ -6,8 +6,10 @@ from collections.abc import Iterator
 
 import cv2
 import numpy as np
+import torch
 
 from endotwin.effects import RENDERED
+from endotwin.effects.tone import Tone
 from endotwin.surface.vectors import dot, unit
 from endotwin.synth.photograph import RECORDING
 from endotwin.synth.proof.warp import DEPTHS, Frame
@@ -184,7 +186,11 @@ def _colors(frame: Frame) -> Iterator[Judged]:
         and has("rgb")
         and not rendered & {"noise", *RECORDING}
         and not record.get("response")
+        and not ("tone" in switched or any(edit.startswith("tone.") for edit in record.get("parameters", ())))
     ):
-        gamma = frame.written.document["twin"]["response"]["gamma"]
+        twin = frame.written.document["twin"]
         lit = (linear > 1e-3) & (linear < 1)
-        yield "response", 255 * np.abs(np.clip(linear, 0, 1) ** gamma - frame.image("rgb"))[lit]
+        shown = torch.from_numpy(np.clip(linear, 0, 1) ** twin["response"]["gamma"])
+        if "tone" in twin["effects"]:
+            shown = Tone(**twin["effects"]["tone"]).shown(shown)
+        yield "response", 255 * np.abs(shown.numpy() - frame.image("rgb"))[lit]

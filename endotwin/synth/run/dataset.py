@@ -31,6 +31,7 @@ from endotwin.synth.run.record import describe
 from endotwin.synth.run.shard import done_shards, frame_record, total
 from endotwin.synth.trajectories import Trajectory
 from endotwin.synth.variation import Variation
+from endotwin.synth.variation.switches import SUCCESSIVE
 from endotwin.twin import Twin
 
 PROOF_PAIRS = 2
@@ -150,8 +151,11 @@ def make_job(
     refusal = LAYOUTS[layout].refusal(camera, labels)
     if refusal:
         raise OptionError(f"layout {layout}: {refusal}")
-    draws = variation.draw(len(trajectory), seed)
+    draws = variation.draw(trajectory.originals, seed)
     used = {*twin.effects, *(name for draw in draws for name, on in draw.effects if on)}
+    moving = [name for name in SUCCESSIVE if name in used]
+    if moving and not trajectory.successive:
+        raise OptionError(f"{moving[0]} needs poses that follow each other, and those of jitter do not")
     filmed = "video" in used
     if filmed:
         Video.require_encoder()

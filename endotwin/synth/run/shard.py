@@ -22,7 +22,7 @@ def frame_record(job: Job, index: int) -> dict:
     trajectory = job.trajectory
     record = {
         "index": index,
-        "pose": int(index if trajectory.numbers is None else trajectory.numbers[index]),
+        "pose": int(trajectory.originals[index]),
         "timestamp_s": float(trajectory.timestamps_s[index]),
         "T_world_camera": trajectory.T_world_camera[index].tolist(),
         "checks": {name: round(float(values[index]), 4) for name, values in trajectory.checks.items()},

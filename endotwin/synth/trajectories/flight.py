@@ -114,6 +114,10 @@ def posed(rotations: np.ndarray, points: np.ndarray) -> np.ndarray:
     return poses
 
 
+MOST_FRAMES = 100_000
+"""Poses are kept in memory; more frames are made as several datasets, each with a seed of its own."""
+
+
 def stops(frames: int, speed: float, length_mm: float) -> np.ndarray:
     """Where on a path of ``length_mm`` the poses are, mm from its start, float64 [N].
 
@@ -123,7 +127,12 @@ def stops(frames: int, speed: float, length_mm: float) -> np.ndarray:
     if frames and not speed:
         return np.linspace(0, length_mm, frames)
     speed = speed or SPEED_MM
-    fits = int(length_mm / speed * (1 + 1e-12)) + 1
+    fits = int(min(length_mm / speed * (1 + 1e-12), MOST_FRAMES)) + 1
+    if not frames and fits > MOST_FRAMES:
+        raise TrajectoryError(
+            f"a camera at {speed:g} mm a frame needs more than {MOST_FRAMES} frames for {length_mm:.1f} mm; "
+            "raise its speed"
+        )
     if frames > fits:
         raise TrajectoryError(
             f"{frames} frames at {speed:g} mm a frame need more than the {length_mm:.1f} mm that the path "

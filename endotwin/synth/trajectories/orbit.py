@@ -27,15 +27,17 @@ def orbit(options: OrbitOptions, twin: Twin) -> tuple[np.ndarray, str]:
     """Poses ``T_world_camera`` float64 [N, 4, 4] on the circle, and its description.
 
     Raises:
-        TrajectoryError: no point is given, or there is none at that pixel. SequenceError: the sequence of
-            ``frame`` is gone.
+        TrajectoryError: no frames, or no point is given, or there is none at that pixel. SequenceError: the
+            sequence of ``frame`` is gone.
     """
+    if not options.frames:
+        raise TrajectoryError("an orbit of 0 frames has no pose; ask for some")
     point = wall_point(options, twin, "orbit", TrajectoryError)
     surface = twin.surface
     nearest = cKDTree(surface.vertices_mm).query(point - surface.origin_mm)[1]
     normal = surface.normals[nearest].astype(np.float64)
     side, beside, _ = frame_along(normal)
-    angle = np.arange(options.frames) * 2 * np.pi / max(options.frames, 1)
+    angle = np.arange(options.frames) * 2 * np.pi / options.frames
     tilt = np.deg2rad(options.tilt)
     around = np.cos(angle)[:, None] * side + np.sin(angle)[:, None] * beside
     away = np.cos(tilt) * normal + np.sin(tilt) * around

@@ -14,7 +14,7 @@ from endotwin.cameras import Camera
 from endotwin.errors import EndotwinError, TrajectoryError
 from endotwin.run.streams import Stream
 from endotwin.sequence.poses import as_poses, frame_times, read_poses
-from endotwin.synth.trajectories.flight import FlightOptions, fly
+from endotwin.synth.trajectories.flight import MOST_FRAMES, FlightOptions, fly
 from endotwin.synth.trajectories.keyframes import SplineOptions, spline_through
 from endotwin.synth.trajectories.orbit import OrbitOptions, orbit
 from endotwin.synth.trajectories.screening import Findings, Gate, Limits
@@ -50,6 +50,16 @@ class Trajectory:
 
     def __len__(self) -> int:
         return len(self.T_world_camera)
+
+    @property
+    def originals(self) -> np.ndarray:
+        """``numbers``, by which is drawn what a pose is rendered with, whatever others are dropped."""
+        return np.arange(len(self)) if self.numbers is None else self.numbers
+
+    @property
+    def successive(self) -> bool:
+        """Whether a camera goes from each pose to the next."""
+        return self.spec.partition(":")[0] != "jitter"
 
 
 @dataclass(frozen=True)
@@ -134,10 +144,9 @@ def kept_in(trajectory: Trajectory, twin: Twin, camera: Camera) -> Trajectory:
     gate, poses = Gate(twin, camera, trajectory.limits or Limits()), trajectory.T_world_camera
     words = (trajectory.spec, poses, trajectory.timestamps_s, trajectory.description)
     kept = _kept(*words, gate, gate.judge(poses))
-    numbers = np.arange(len(poses)) if trajectory.numbers is None else trajectory.numbers
     dropped = trajectory.counts.get("dropped", 0) + len(poses) - len(kept)
     counts = {**trajectory.counts, "dropped": dropped}
-    return replace(kept, numbers=numbers[kept.numbers], counts=counts)
+    return replace(kept, numbers=trajectory.originals[kept.numbers], counts=counts)
 
 
 def allowed_specs() -> str:
@@ -157,9 +166,6 @@ GREATEST = 1e7
 
 IN_METRES = 2e-3
 """Of the surface's extent: a path in mm that is read in metres reaches less far."""
-
-MOST_FRAMES = 100_000
-"""Poses are kept in memory; more frames are made as several datasets, each with a seed of its own."""
 
 
 def parse_options(

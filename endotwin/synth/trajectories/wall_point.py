@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from math import isnan, nan
+from math import nan
 
 import numpy as np
 
@@ -19,14 +19,14 @@ class WallPoint:
     x: float = field(default=nan, metadata={"help": "the point, world mm", "signed": True})
     y: float = field(default=nan, metadata={"help": "the point, world mm", "signed": True})
     z: float = field(default=nan, metadata={"help": "the point, world mm", "signed": True})
-    frame: int = field(default=0, metadata={"help": "or the point at pixel u, v of this frame"})
+    frame: int = field(default=-1, metadata={"help": "or the point at pixel u, v of this frame; else of 0"})
     u: float = field(default=nan, metadata={"help": "pixel, to the right"})
     v: float = field(default=nan, metadata={"help": "pixel, down"})
 
     @property
     def placed(self) -> bool:
         """Whether any part of a place is given."""
-        return not np.isnan([self.x, self.y, self.z, self.u, self.v]).all()
+        return self.frame >= 0 or not np.isnan([self.x, self.y, self.z, self.u, self.v]).all()
 
 
 def wall_point(options: WallPoint, twin: Twin, what: str, error: type[EndotwinError]) -> np.ndarray:
@@ -35,14 +35,17 @@ def wall_point(options: WallPoint, twin: Twin, what: str, error: type[EndotwinEr
     Raises:
         error: none is given, or there is none at that pixel. SequenceError: the sequence is gone.
     """
-    given = np.array([options.x, options.y, options.z])
+    given, pixel = np.array([options.x, options.y, options.z]), np.array([options.u, options.v])
+    if not np.isnan(given).all() and (options.frame >= 0 or not np.isnan(pixel).all()):
+        raise error(f"{what} has two points: give x, y and z, or frame, u and v")
     if not np.isnan(given).any():
         return given
-    if isnan(options.u) or isnan(options.v):
+    if np.isnan(pixel).any():
         raise error(f"{what} needs its point: give x, y and z, or frame, u and v")
     poses, camera = twin.sequence().T_world_camera, twin.camera
-    if options.frame >= len(poses):
-        raise error(f"{what}: there is no frame {options.frame}; the sequence has {len(poses)}")
+    frame = max(options.frame, 0)
+    if frame >= len(poses):
+        raise error(f"{what}: there is no frame {frame}; the sequence has {len(poses)}")
     mask = np.zeros((camera.height, camera.width), bool)
     column, row = round(options.u), round(options.v)
     if column >= camera.width or row >= camera.height:
@@ -50,7 +53,7 @@ def wall_point(options: WallPoint, twin: Twin, what: str, error: type[EndotwinEr
             f"{what}: pixel {column}, {row} is outside of {camera.width}×{camera.height}; choose another"
         )
     mask[row, column] = True
-    hits = Caster(twin.surface, threads=1).cast(camera, poses[options.frame], mask)
+    hits = Caster(twin.surface, threads=1).cast(camera, poses[frame], mask)
     if not len(hits):
-        raise error(f"{what}: pixel {column}, {row} of frame {options.frame} sees no surface; choose another")
+        raise error(f"{what}: pixel {column}, {row} of frame {frame} sees no surface; choose another")
     return surface_points(twin.surface, hits)[0]

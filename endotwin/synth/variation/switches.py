@@ -56,7 +56,7 @@ def equipped(twin: Twin, states: Mapping[str, str], trajectory: object) -> Twin:
             f"{undecided[0]}=auto is for 'endotwin fit', which decides; write {undecided[0]}=on or off here"
         )
     effects = twin.effects.without([name for name, state in states.items() if state == "off"])
-    still = SUCCESSIVE if str(trajectory).startswith("jitter") else ()
+    still = SUCCESSIVE if str(trajectory).partition(":")[0] == "jitter" else ()
     if sequence is not None:
         asked = [name for name in RENDERED if name not in states and name not in still]
         shown = [effect for name in asked if (effect := effect_class(name).evidence(sequence)[0])]

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -137,10 +138,10 @@ class Variation:
         regions = (replace(each, weight=(weights @ each.weight).astype(np.float32)) for each in self.regions)
         return replace(self, regions=tuple(regions))
 
-    def draw(self, frames: int, seed: int) -> tuple[Draw, ...]:
-        """One draw a frame, the same for the same seed whatever is rendered."""
-        clips = [self._draw(Stream.VARIATION.generator(seed, k)) for k in range(-(-frames // self.clip))]
-        return tuple(clips[index // self.clip] for index in range(frames))
+    def draw(self, frames: Iterable[int], seed: int) -> tuple[Draw, ...]:
+        """One draw for each of the numbers ``frames``, the same for the same seed whatever is rendered."""
+        drawn = cache(lambda clip: self._draw(Stream.VARIATION.generator(seed, clip)))
+        return tuple(drawn(int(frame) // self.clip) for frame in frames)
 
     def _draw(self, generator: np.random.Generator) -> Draw:
         def drawn(ranges: Sequence[Range]) -> tuple[Edit, ...]:
