@@ -1,6 +1,7 @@
-"""The command line, run in the tests' own process."""
+"""The command line, run in the tests' own process, or several commands in one other."""
 
 import io
+import subprocess
 import sys
 from contextlib import chdir, redirect_stdout
 from subprocess import CompletedProcess
@@ -28,3 +29,29 @@ def in_one_process(patch: pytest.MonkeyPatch) -> None:
         return CompletedProcess(command, code, out.getvalue(), "")
 
     patch.setattr("endotwin.tradeoff.measure.subprocess", SimpleNamespace(run=run))
+
+
+CHILD = """
+import sys
+from endotwin.cli.start import main
+
+codes = []
+for command in sys.argv[1:]:
+    sys.argv = ["endotwin", *command.split("\x1f")]
+    try:
+        main()
+    except SystemExit as done:
+        codes.append(done.code or 0)
+print(*codes, file=sys.stderr)
+"""
+
+
+def in_one_child(*commands: list[object], python: tuple[str, ...] = (), first: str = "", **options):
+    """Run ``commands`` one after the other in one process, after the code ``first``; what it gave in bytes,
+    and their exit codes."""
+    asked = ["\x1f".join(map(str, command)) for command in commands]
+    done = subprocess.run(
+        [sys.executable, *python, "-c", first + CHILD, *asked], capture_output=True, check=False, **options
+    )
+    assert done.returncode == 0, done.stderr.decode()
+    return done, [int(code) for code in done.stderr.decode().splitlines()[-1].split()]

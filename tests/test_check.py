@@ -3,7 +3,6 @@ right."""
 
 import json
 import shutil
-from itertools import cycle
 from pathlib import Path
 
 import cv2
@@ -30,15 +29,8 @@ from endotwin.sequence.readers import open_sequence
 
 pytestmark = pytest.mark.slow
 
-QUICK = [
-    "poses transposed",
-    "poses inverted",
-    "poses in m",
-    "intrinsics of half size",
-    "principal point + 0.5 px",
-    "photos one frame late",
-    "one pose for all",
-]
+OF_POSES = ["poses transposed", "poses inverted", "poses in m", "one pose for all"]
+OF_LENS = ["intrinsics of half size", "principal point + 0.5 px", "photos one frame late"]
 OFFSETS = st.floats(-2, 2)
 
 
@@ -79,9 +71,9 @@ def test_photos_whose_red_and_blue_are_swapped_are_noted(example, tmp_path):
     assert report.consistent and any("red and blue may be swapped" in note for note in report.notes)
 
 
-@pytest.mark.parametrize("name", QUICK)
+@pytest.mark.parametrize("name", [*OF_POSES, *OF_LENS])
 def test_a_planted_mistake_is_named(example, tmp_path, name):
-    found = named(damaged(example, tmp_path / "copy", name))
+    found = named(damaged(example, tmp_path / "copy", name, noise=0.005 if name in OF_POSES else 0.0))
     assert found and found <= set(DAMAGES[name].named)
 
 
@@ -253,12 +245,14 @@ def test_a_small_error_of_scale_costs_agreement_in_proportion(example):
     assert right < 1e-4 and far == pytest.approx(2 * near, rel=0.1)
 
 
-@pytest.mark.parametrize("sequence", ["colon_direct", "colon_gi", "colon_offset", "colon_fisheye"])
+@pytest.mark.parametrize("sequence", ["colon_gi", "colon_offset", "colon_fisheye"])
 def test_larger_sound_sequences_pass(data_root, sequence):
     assert named(data_root / sequence) == set()
 
 
-@pytest.mark.parametrize(("name", "sequence"), zip(QUICK, cycle(["colon_gi", "colon_fisheye"]), strict=False))
+@pytest.mark.parametrize(
+    ("name", "sequence"), list(zip(OF_LENS, ["colon_fisheye", "colon_gi", "colon_fisheye"], strict=True))
+)
 def test_mistakes_in_larger_noisy_sequences_are_named(data_root, tmp_path, name, sequence):
     found = named(damaged(data_root / sequence, tmp_path / "copy", name, noise=0.005))
     assert found and found <= set(DAMAGES[name].named)

@@ -138,12 +138,6 @@ def test_light_and_response_of_a_lambertian_tube_are_recovered(tube):
     assert endotwin.evaluate(twin).psnr_covered > 36
 
 
-def test_the_same_seed_gives_the_same_twin_to_the_bit(tube):
-    one, other = (endotwin.fit_twin(tube, seed=3) for _ in range(2))
-    assert same_materials(one, other)
-    assert (one.light, one.response) == (other.light, other.response)
-
-
 def test_pixels_beyond_the_number_asked_for_are_drawn_by_the_seed(tube):
     caster = Caster(tube.surface)
     every = gather(tube, Pace(FitConfig(pixels=10**9)), 0, caster)

@@ -13,8 +13,8 @@ pytestmark = pytest.mark.slow
 COMMANDS = {
     "fuse": ("new", "fuse tube -o new"),
     "fuse over a twin": ("twin", "fuse tube -o twin --overwrite"),
-    "fit": ("new", "fit twin -o new --budget 1"),
-    "fit in place": ("twin", "fit twin --overwrite --budget 1"),
+    "fit": ("new", "fit twin -o new --budget 0.1"),
+    "fit in place": ("twin", "fit twin --overwrite --budget 0.1"),
     "eval": ("twin", "eval twin"),
     "eval with a picture": ("sheet.png", "eval twin --sheet sheet.png"),
     "eval with a profile": ("profile.json", "eval read_only --profile profile.json"),

@@ -30,7 +30,7 @@ OVER = {
     "export of a page": ("new.html", "export twin new.html"),
 }
 STUDY = "study depth --real tube --twin twin --test other --network small --frames 2 --steps 1"
-TRADEOFF = "tradeoff tube --rungs draft+budget=1 --repeats 1"
+TRADEOFF = "tradeoff tube --rungs draft+budget=0.1 --repeats 1"
 LONG = {
     "tradeoff": ("new", f"{TRADEOFF} -o new"),
     "tradeoff over another": ("traded", f"{TRADEOFF} -o traded --overwrite"),

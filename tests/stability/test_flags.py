@@ -18,7 +18,7 @@ pytestmark = pytest.mark.slow
 VALID = {
     "fuse": "fuse tube -o out",
     "align": "align twin -o out",
-    "fit": "fit twin -o out --budget 1",
+    "fit": "fit twin -o out --budget 0.1",
     "eval": "eval twin",
     "synth": "synth twin --trajectory jitter:frames=1 -o out --workers 1",
     "inspect": "inspect twin --screenshot out.png --map coverage",
