@@ -309,7 +309,7 @@ def test_no_valid_depth_at_all_is_one_sentence(tube):
     "options",
     [
         *({"voxel_mm": value} for value in (0.0, -1.0, np.nan)),
-        *({"voxel": value} for value in (0.0, 1e-3)),
+        *({"voxel": value} for value in (0.0, -1.0)),
         {"frames": []},
     ],
 )

@@ -201,8 +201,6 @@ def registered(
         voxel_mm = made.get("voxel_mm")
         if voxel_mm is not None and number < ROUNDS - 1:
             voxel_mm *= COARSER
-        surface = fusion.fuse(
-            at_poses, frames.tolist(), training, voxel_mm, factor, lambda stage, done, total: None
-        )
+        surface = fusion.fuse(at_poses, frames.tolist(), training, voxel_mm, factor)
         progress("align depth maps", number + 1, ROUNDS)
     return surface, now

@@ -65,13 +65,14 @@ def fuse(
         frames: indices whose depth may be used; all unless given.
         photo_frames: indices that count for the coverage; ``frames`` unless given.
         voxel_mm: voxel edge of the TSDF; chosen from the pixel footprint and the noise unless given.
-        voxel: factor on the edge that is chosen.
+        voxel: factor on the edge that is chosen, as far as memory allows.
         progress: called with (stage, done, total) as each frame of a stage begins.
         record: to which the frames that were fused, and the number of those with nothing new, are added.
 
     Raises:
         SequenceError: no frame has valid depth, or the depth gives no surface.
-        OptionError: a voxel size, or a factor on it, that is not positive or that no memory holds; no frames.
+        OptionError: a voxel size, or a factor on it, that is not positive; a size that no memory holds; no
+            frames.
     """
     frames = list(range(len(sequence)) if frames is None else frames)
     photo_frames = frames if photo_frames is None else list(photo_frames)
@@ -94,15 +95,20 @@ def fuse(
     if width_px >= 1:
         reading = {"shelf": Shelf(), "change": partial(denoised, noise=scatter, width_px=width_px)}
     doubt_positions(sequence, frames, median_mm)
-    if voxel_mm is not None:
-        _check_voxel(voxel_mm, median_mm, least_mm)
+    if voxel_mm is not None and voxel_mm > median_mm:
+        raise OptionError(
+            f"A voxel of {voxel_mm:g} mm is larger than the usual depth, {median_mm:.3g} mm; choose less."
+        )
+    if voxel_mm is not None and voxel_mm < least_mm:
+        raise OptionError(
+            f"A voxel of {voxel_mm:g} mm needs more than 2 GB of memory; choose {least_mm:.2g} or more."
+        )
     origin_mm = np.median(np.asarray(sequence.T_world_camera, np.float64)[frames, :3, 3], axis=0)
     coarse_mm = COARSE_VOXELS * max(finest_mm, voxel_mm or 0.0)
     coarse = fuse_tsdf(camera, views("noise", sample), origin_mm, coarse_mm, noise_mm=0.0)
     noise = measured_noise(camera, surface_of(origin_mm, *coarse), views("noise", sample))
     if voxel_mm is None:
-        voxel_mm = voxel * max(finest_mm, noise * median_mm)
-        _check_voxel(voxel_mm, median_mm, least_mm)
+        voxel_mm = max(voxel * max(finest_mm, noise * median_mm), least_mm)
     tolerance = Tolerance.of(voxel_mm, noise)
     doubt_scatter(sequence, max(noise, scatter))
 
@@ -138,18 +144,6 @@ def fuse(
     if record is not None:
         record.update(fused=fused, nothing_new=len(frames) - len(fused))
     return surface
-
-
-def _check_voxel(voxel_mm: float, median_mm: float, least_mm: float) -> None:
-    """Raise OptionError for voxels larger than the ``median_mm`` of depth, or smaller than memory holds."""
-    if voxel_mm > median_mm:
-        raise OptionError(
-            f"A voxel of {voxel_mm:g} mm is larger than the usual depth, {median_mm:.3g} mm; choose less."
-        )
-    if voxel_mm < least_mm:
-        raise OptionError(
-            f"A voxel of {voxel_mm:g} mm needs more than 2 GB of memory; choose {least_mm:.2g} or more."
-        )
 
 
 def _reported(stage: str, frames: list[int], progress: Progress | None) -> Iterable[int]:

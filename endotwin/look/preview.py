@@ -11,6 +11,7 @@ import numpy as np
 from endotwin.look.inspector import Map, Stage, twin_maps
 from endotwin.run.output import check_picture
 from endotwin.sequence.images import write_png
+from endotwin.sequence.spread import spread
 from endotwin.synth.encodings import encode_color
 from endotwin.synth.job import Job
 from endotwin.synth.labels import Labeller
@@ -54,7 +55,7 @@ def contact_sheet(job: Job) -> np.ndarray:
     labeller = Labeller(job)
     blank = np.zeros((small.height, small.width, 3), np.uint8)
     tiles = []
-    for index in np.linspace(0, len(job) - 1, min(COLUMNS * ROWS, len(job))).round().astype(int):
+    for index in spread(len(job), COLUMNS * ROWS):
         tile = np.ascontiguousarray(encode_color(labeller.frame(int(index))["rgb"]))
         for color, width in ((BLACK, 3), (WHITE, 1)):
             cv2.putText(tile, str(index), (5, 16), cv2.FONT_HERSHEY_SIMPLEX, 0.45, color, width, cv2.LINE_AA)

@@ -18,6 +18,7 @@ from endotwin.run.output import whole_file
 from endotwin.run.threads import THREADS
 from endotwin.sequence import Sequence
 from endotwin.sequence.sequence import resized_depth
+from endotwin.sequence.spread import spread
 from endotwin.study.accuracy import FARTHEST_MM
 from endotwin.study.corruptions import as_jpeg
 from endotwin.synth.containers import pixels
@@ -56,8 +57,7 @@ class Frames:
 
     def some(self, count: int) -> Frames:
         """``count`` of them, evenly spread; all where there are no more."""
-        spread = np.linspace(0, len(self) - 1, min(count, len(self))).round().astype(int)
-        return replace(self, chosen=self.chosen[spread])
+        return replace(self, chosen=self.chosen[spread(len(self), count)])
 
 
 def of_sequence(sequence: Sequence, size: Size) -> Iterator[Frame]:

@@ -10,6 +10,7 @@ from importlib.metadata import version
 import numpy as np
 
 from endotwin.cameras import Camera
+from endotwin.sequence.spread import spread
 from endotwin.synth.motion import Motion
 from endotwin.synth.trajectories import Trajectory
 from endotwin.synth.variation import Draw
@@ -68,7 +69,7 @@ class Job:
     @property
     def thumbnails(self) -> set[int]:
         """Indices of the frames that the datasheet shows."""
-        return set(np.linspace(0, len(self) - 1, min(THUMBNAILS, len(self))).round().astype(int).tolist())
+        return set(spread(len(self), THUMBNAILS).tolist())
 
     def digest(self) -> str:
         """SHA-256 of all that decides the bytes: equal for the same command on the same twin and versions."""

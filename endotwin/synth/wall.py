@@ -12,6 +12,7 @@ from scipy.spatial import cKDTree
 from endotwin.cameras import Camera
 from endotwin.errors import OptionError, TwinError
 from endotwin.run.arguments import texts
+from endotwin.sequence.spread import spread
 from endotwin.surface import Surface
 from endotwin.surface.casting import Caster
 from endotwin.surface.vectors import dot, unit
@@ -104,8 +105,7 @@ class Wall:
         if self._trajectory is None:
             seen = np.flatnonzero((surface.seen_by > 0) & ~surface.filled)
             return surface.vertices_mm[seen].astype(np.float64), surface.normals[seen]
-        chosen = np.linspace(0, len(self._trajectory) - 1, VIEWS).round().astype(int)
-        poses = self._trajectory.T_world_camera[np.unique(chosen)]
+        poses = self._trajectory.T_world_camera[spread(len(self._trajectory), VIEWS)]
         views = [_seen_from(pose, surface, self._camera, self._caster) for pose in poses]
         return tuple(np.concatenate(each) for each in zip(*views, strict=True))
 

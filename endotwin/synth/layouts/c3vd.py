@@ -7,10 +7,9 @@ from pathlib import Path
 from endotwin.cameras import write_camera
 from endotwin.sequence.poses import write_c3vd_poses
 from endotwin.synth.job import Job
-from endotwin.synth.layouts.layout import CAMERA_WORDS, Layout, frame_name, write_lines
+from endotwin.synth.layouts.layout import CAMERA_WORDS, Layout, frame_name, in_folders, write_lines
 
 V1_NAMES = {"rgb": "color"}
-V2_FOLDERS = {"flow": "optical_flow", "occlusion": "occlusions"}
 
 WORDS = {
     "poses": "pose.txt: a line a frame, the 4x4 camera-to-world matrix column by column (C3VD's order), mm",
@@ -34,7 +33,7 @@ V1 = Layout(
 
 V2 = Layout(
     "c3vd2",
-    lambda job, index, image, suffix: f"{V2_FOLDERS.get(image, image)}/{frame_name(job, index)}{suffix}",
+    in_folders({"flow": "optical_flow", "occlusion": "occlusions"}),
     _tables,
     WORDS,
 )

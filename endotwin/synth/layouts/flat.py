@@ -10,17 +10,12 @@ from endotwin.synth.job import Job
 from endotwin.synth.layouts.layout import (
     CAMERA_WORDS,
     Layout,
-    frame_name,
+    in_folders,
     needs,
     write_lines,
 )
 
-FOLDERS = {"rgb": "images"}
 LEVELS_PER_MM = 100
-
-
-def _place(job: Job, index: int, image: str, suffix: str) -> str:
-    return f"{FOLDERS.get(image, image)}/{frame_name(job, index)}{suffix}"
 
 
 def _tables(folder: Path, job: Job) -> None:
@@ -31,7 +26,7 @@ def _tables(folder: Path, job: Job) -> None:
 
 LAYOUT = Layout(
     "flat",
-    _place,
+    in_folders({"rgb": "images"}),
     _tables,
     {
         "list": "filelist.txt: 'image depth' a line, from the dataset's folder, as Depth Anything V2's "

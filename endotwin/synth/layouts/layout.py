@@ -70,6 +70,11 @@ def frame_name(job: Job, index: int) -> str:
     return f"{index:0{job.digits}d}"
 
 
+def in_folders(names: Mapping[str, str]) -> Callable[[Job, int, str, str], str]:
+    """Places of images in a folder each, called as in ``names``, or else as the image is."""
+    return lambda job, index, image, suffix: f"{names.get(image, image)}/{frame_name(job, index)}{suffix}"
+
+
 def write_lines(path: Path, lines: list[str]) -> None:
     """A text file of ``lines``."""
     path.write_text("".join(f"{line}\n" for line in lines), encoding="utf-8")

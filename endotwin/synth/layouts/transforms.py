@@ -9,17 +9,12 @@ from endotwin.cameras import Camera, Fisheye, Pinhole
 from endotwin.sequence.poses import AXES_OPENGL_OPENCV, MM_PER_UNIT
 from endotwin.synth.encodings import depth_png
 from endotwin.synth.job import Job
-from endotwin.synth.layouts.layout import Layout, frame_name, needs
+from endotwin.synth.layouts.layout import Layout, in_folders, needs
 
-FOLDERS = {"rgb": "images"}
 PATHS = {"depth": ("depth_file_path", "depth_path"), "mask": ("mask_path",)}
 """What frames call their images: nerfstudio, and instant-ngp, which knows no masks."""
 LEVELS_PER_MM = 500
 DEPTH_SCALE = 1 / LEVELS_PER_MM / MM_PER_UNIT["m"]
-
-
-def _place(job: Job, index: int, image: str, suffix: str) -> str:
-    return f"{FOLDERS.get(image, image)}/{frame_name(job, index)}{suffix}"
 
 
 def _refusal(camera: Camera, labels: tuple[str, ...]) -> str:
@@ -67,7 +62,7 @@ def _tables(folder: Path, job: Job) -> None:
 
 LAYOUT = Layout(
     "transforms",
-    _place,
+    in_folders({"rgb": "images"}),
     _tables,
     {
         "poses": "transforms.json: camera-to-world matrices, positions in metres, camera axes x right, y "
