@@ -148,7 +148,7 @@ def test_a_frame_that_is_all_invalid_is_skipped_with_a_warning_that_names_it(end
         (lambda T: np.divide(T[:, :3, 3], 1000, out=T[:, :3, 3]), "endotwin check"),
         (lambda T: np.copyto(T, T @ np.diag([1, -1, -1, 1.0])), "endotwin check"),
         (lambda T: np.multiply(T[:, :3, 3], 1000, out=T[:, :3, 3]), "unit"),
-        (lambda T: np.add(T[5, :3, 3], 1e3, out=T[5, :3, 3]), "0005_color.png"),
+        (lambda T: np.add(T[5, :3, 3], 1e9, out=T[5, :3, 3]), "0005_color.png"),
         (lambda T: np.add(T[5, :3, 3], (3, 0, 0), out=T[5, :3, 3]), "0005_depth.tiff"),
     ],
     ids=["metres", "OpenGL's axes", "micrometres", "one far away", "one beside its place"],

@@ -13,7 +13,7 @@ from endotwin.fusion.agreement import Tolerance, measured_noise
 from endotwin.fusion.choice import WORTH_PIXELS, chosen, compared, differing, glances
 from endotwin.fusion.coverage import covered, covered_by_glances
 from endotwin.fusion.denoise import denoised, pixel_noise
-from endotwin.fusion.doubts import doubt_frames, doubt_positions, doubt_scatter
+from endotwin.fusion.doubts import doubt_frames, doubt_scatter, without_strays
 from endotwin.fusion.holes import filled
 from endotwin.fusion.margin import with_margin
 from endotwin.fusion.mesh import surface_of, without_short_edges
@@ -94,7 +94,8 @@ def fuse(
     width_px = WIDTH_PX * scatter * median_mm / finest_mm
     if width_px >= 1:
         reading = {"shelf": Shelf(), "change": partial(denoised, noise=scatter, width_px=width_px)}
-    doubt_positions(sequence, frames, median_mm)
+    frames = without_strays(sequence, frames, median_mm)
+    sample = [frames[k] for k in spread(len(frames), SAMPLED_FRAMES)]
     if voxel_mm is not None and voxel_mm > median_mm:
         raise OptionError(
             f"A voxel of {voxel_mm:g} mm is larger than the usual depth, {median_mm:.3g} mm; choose less."

@@ -1,4 +1,4 @@
-"""What depth maps and poses say against one another, told as warnings: the mesh is made all the same."""
+"""What depth maps and poses say against one another, told as warnings: a mesh is made all the same."""
 
 from __future__ import annotations
 
@@ -21,10 +21,11 @@ CONTRADICTED, AGREED = 0.5, 0.7
 logger = logging.getLogger("endotwin")
 
 
-def doubt_positions(sequence: Sequence, frames: list[int], median_mm: float) -> None:
-    """Warn of cameras that lie beyond what any other sees, where ``median_mm`` is the usual distance seen."""
+def without_strays(sequence: Sequence, frames: list[int], median_mm: float) -> list[int]:
+    """``frames`` but for those, told as warnings, whose cameras lie beyond what any other sees, where
+    ``median_mm`` is the usual distance seen; all of them where most lie so."""
     if len(frames) < 2:
-        return
+        return frames
     positions_mm = sequence.T_world_camera[frames, :3, 3]
     gap_mm = cKDTree(positions_mm).query(positions_mm, k=2)[0][:, 1]
     stray = np.flatnonzero(gap_mm > STRAY_DEPTHS * median_mm)
@@ -34,10 +35,13 @@ def doubt_positions(sequence: Sequence, frames: list[int], median_mm: float) -> 
             "in their unit; %s",
             *(sequence.path, np.median(gap_mm), median_mm, _remedy(sequence)),
         )
-    else:
-        for index in stray:
-            name = sequence.color_files[frames[index]]
-            logger.warning("the camera of %s is %.3g mm from any other; check its pose", name, gap_mm[index])
+        return frames
+    for index in stray:
+        logger.warning(
+            "the camera of %s is %.3g mm from any other, and left out of the surface; check its pose",
+            *(sequence.color_files[frames[index]], gap_mm[index]),
+        )
+    return np.delete(frames, stray).tolist()
 
 
 def doubt_scatter(sequence: Sequence, noise: float) -> None:
