@@ -16,14 +16,13 @@ import csv
 import html
 import json
 import math
-import shutil
 import subprocess
 import sys
 from dataclasses import dataclass
 from io import StringIO
 from pathlib import Path
 
-from endotwin.errors import EndotwinError
+from endotwin.errors import EndotwinError, OutputError
 from endotwin.run.output import whole_file
 from endotwin.sequence.readers import c3vd
 
@@ -122,14 +121,14 @@ def endotwin(*arguments: object) -> subprocess.CompletedProcess:
 def score(folder: Path, options: tuple[str, ...], work: Path) -> dict:
     """What a sequence gave: the scores and the cost of each step, or the error that ended it.
 
-    Steps that an earlier run of the same folder and options has done are not done again.
+    Steps that an earlier run has done are not done again; raises OutputError if that was of something else.
     """
     twin, kept, note = work / "twin", work / "row.json", work / "asked.json"
     asked = json.dumps([str(folder.resolve()), *options])
-    if not note.exists() or note.read_text(encoding="utf-8") != asked:
-        shutil.rmtree(work, ignore_errors=True)
-        work.mkdir(parents=True)
-        note.write_text(asked, encoding="utf-8")
+    if note.exists() and note.read_text(encoding="utf-8") != asked:
+        raise OutputError(f"{work} holds what another folder or other options gave; name another with --work")
+    work.mkdir(parents=True, exist_ok=True)
+    note.write_text(asked, encoding="utf-8")
     if kept.exists():
         return json.loads(kept.read_text(encoding="utf-8"))
     steps = {"fuse": ("fuse", folder, "-o", twin, *options), "align": ("align", twin), "fit": ("fit", twin)}

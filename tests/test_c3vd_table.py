@@ -43,3 +43,6 @@ def test_the_table_has_every_sequence_the_published_rows_and_goes_on_where_it_wa
     (work / "coliags-draft" / "cecum_t1_a" / "row.json").write_text(json.dumps(kept))
     rows, _ = table(root, work, "--protocol", "coliags", "--sequences", "cecum_t1_a", "cecum_t1_b")
     assert [row["PSNR"] for row in rows[:3]] == ["12.34", "", "12.34"]
+    (tmp_path / "download").rename(tmp_path / "other")
+    rows, _ = table(tmp_path / "other", work, "--protocol", "coliags", "--sequences", "cecum_t1_a")
+    assert "name another with --work" in rows[0]["note"]

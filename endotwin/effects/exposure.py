@@ -148,8 +148,7 @@ def following(T_world_camera: np.ndarray, times_s: np.ndarray | None = None) -> 
     if len(T) < 2:
         return T.copy()
     later = T[1:].copy()
-    if times_s is not None:
-        steps_s = np.diff(times_s)
+    if times_s is not None and (steps_s := np.diff(times_s)).min() > 0:
         share = np.median(steps_s) / steps_s
         for k in np.flatnonzero(np.abs(share - 1) > SAME_INTERVAL):
             later[k] = T[k] @ RigidTransform.from_exp_coords(share[k] * _screw(T[k], T[k + 1])).as_matrix()
