@@ -107,6 +107,15 @@ def rigid(matrices: np.ndarray, where: Callable[[int], str]) -> np.ndarray:
     return matrices
 
 
+def is_rigid(matrices: np.ndarray) -> np.ndarray:
+    """Bool [N]: rotation, no reflection, last row (0, 0, 0, 1), within the tolerance."""
+    rotation = matrices[:, :3, :3]
+    gram = rotation.transpose(0, 2, 1) @ rotation
+    orthonormal = np.abs(gram - np.eye(3)).max(axis=(1, 2)) <= RIGID_TOLERANCE
+    last_row = np.abs(matrices[:, 3] - (0, 0, 0, 1)).max(axis=1) <= RIGID_TOLERANCE
+    return orthonormal & last_row & (np.linalg.det(rotation) > 0)
+
+
 def as_poses(given: object) -> np.ndarray:
     """Poses float64 [N, 4, 4] from anything that NumPy reads as matrices [N, 4, 4], or as one [4, 4].
 
@@ -271,15 +280,6 @@ def natural_order(name: str) -> list[tuple[int, int | str]]:
 def _require(good: np.ndarray, where: Callable[[int], str], fault: str) -> None:
     if not good.all():
         raise SequenceError(f"{where(int(good.argmin()))}: the pose {fault}")
-
-
-def is_rigid(matrices: np.ndarray) -> np.ndarray:
-    """Bool [N]: rotation, no reflection, last row (0, 0, 0, 1), within the tolerance."""
-    rotation = matrices[:, :3, :3]
-    gram = rotation.transpose(0, 2, 1) @ rotation
-    orthonormal = np.abs(gram - np.eye(3)).max(axis=(1, 2)) <= RIGID_TOLERANCE
-    last_row = np.abs(matrices[:, 3] - (0, 0, 0, 1)).max(axis=1) <= RIGID_TOLERANCE
-    return orthonormal & last_row & (np.linalg.det(rotation) > 0)
 
 
 def _words(line: str) -> list[str]:
