@@ -21,7 +21,7 @@ def inspect(
         str | None,
         typer.Option(
             metavar="NAME",
-            help="Show base_color, roughness, metallic, coverage or normals; scope: the view through it.",
+            help="Show base_color, roughness, metallic, film, coverage or normals; scope: the view by it.",
             show_default="all",
         ),
     ] = None,

@@ -13,7 +13,7 @@ def selfcheck(
     as_json: Annotated[bool, typer.Option("--json", help="Print the findings as JSON.")] = False,
     profile: console.Profile = None,
 ) -> None:
-    """Check the numerics on this machine in under a minute: promised bound and measured value of each case.
+    """Check the numerics on this machine in about a minute: promised bound and measured value of each case.
 
     Light and BRDF against 40 digits, broken meshes and depth maps, blind cameras, the fit's repeatability.
     Exit code 1 if a bound is broken.

@@ -17,7 +17,7 @@ study = typer.Typer(no_args_is_help=True)
 def describe() -> None:
     """Measure what datasets rendered from a twin are worth.
 
-    Example: endotwin study depth --real cecum --twin twin --test sigmoid --test rectum -o study
+    Example: endotwin study depth --real cecum_t1_a --twin twin --test sigmoid_t1_a --test trans_t1_a -o study
     """
 
 
@@ -75,7 +75,7 @@ def depth(
     or trained on: that is checked. DIR gets the table depth.csv, the plot depth.png and .svg, the page
     depth.html and the trained weights. A run that was stopped goes on when the command is run again.
 
-    Example: endotwin study depth --real cecum --twin twin --test sigmoid --test rectum -o study
+    Example: endotwin study depth --real cecum_t1_a --twin twin --test sigmoid_t1_a --test trans_t1_a -o study
     """
     check_free(output, overwrite, STUDY)
     check_apart(output, [*real, *twin, *test])

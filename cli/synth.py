@@ -69,7 +69,9 @@ def synth(
     ] = None,
     vary: Annotated[
         Path | None,
-        typer.Option(metavar="FILE.yaml", help="Draw edits from the ranges in this file, frame by frame."),
+        typer.Option(
+            metavar="FILE.yaml", help="Draw edits from the ranges in this file, for each frame or clip."
+        ),
     ] = None,
     effects: Annotated[
         str,

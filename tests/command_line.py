@@ -38,10 +38,13 @@ from endotwin.cli.start import main
 codes = []
 for command in sys.argv[1:]:
     sys.argv = ["endotwin", *command.split("\x1f")]
+    code = 0
     try:
         main()
     except SystemExit as done:
-        codes.append(done.code or 0)
+        code = done.code or 0
+    codes.append(code)
+    print("\x1e", end="", flush=True)
 print(*codes, file=sys.stderr)
 """
 

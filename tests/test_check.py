@@ -107,9 +107,9 @@ def test_frames_of_tissue_that_moves_are_not_held_against_one_another(example, t
     assert "moves by itself" in report.notes[0]
 
 
-@pytest.mark.parametrize(("width", "height"), [(16, 16), (64, 20)])
+@pytest.mark.parametrize(("width", "height"), [(16, 16), (64, 20), (40, 30)])
 def test_pictures_of_a_few_pixels_are_checked_as_far_as_they_tell(tmp_path, width, height):
-    report = check(tube_sequence.write(tmp_path / "tube", 5, width, height))
+    report = check(tube_sequence.write(tmp_path / "tube", 6, width, height))
     assert report.consistent and report.notes
 
 

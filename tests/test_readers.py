@@ -262,7 +262,9 @@ def test_named_floating_point_depth_is_read(tmp_path):
         ({"fl_x": -1}, "'fx'"),
         ({"k4": 0.1}, "'k4'"),
         ({"cx": "middle"}, "'cx'"),
-        ({"fl_x": None, "camera_angle_x": 0}, "neither 'fl_x' nor 'camera_angle_x'"),
+        ({"fl_x": None}, "neither 'fl_x' nor 'camera_angle_x'"),
+        ({"fl_x": None, "camera_angle_x": 0}, "field of view of 0 radians"),
+        ({"fl_x": None, "camera_angle_x": 3.2}, "field of view of 3.2 radians"),
         ({"camera_model": "OPENCV", "is_fisheye": True}, "'is_fisheye' and 'OPENCV'"),
     ],
 )

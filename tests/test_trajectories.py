@@ -130,6 +130,12 @@ def test_jitter_moves_and_turns_each_pose_within_its_ranges(recorded):
     assert 0.75 < np.mean(moves > 0.75) < 0.97 and 0.3 < np.mean(turns > 3) < 0.7
 
 
+def test_jitter_alone_is_no_path(recorded):
+    twin, _ = recorded
+    assert not parse_trajectory("jitter:frames=3", twin, 0).successive
+    assert parse_trajectory("centerline:frames=3", twin, 0).successive
+
+
 def test_jitter_depends_on_the_seed_alone(recorded):
     twin, poses = recorded
     one, same, other = (parse_trajectory("jitter:", twin, seed).T_world_camera for seed in (7, 7, 8))

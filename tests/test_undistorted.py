@@ -58,6 +58,7 @@ def test_a_twin_of_undistorted_frames_opens_them_so_again(distorted, tmp_path):
     half, halved = twin.source.shrunk(0.5).open().camera, twin.camera.scaled(0.5)
     np.testing.assert_allclose(half.matrix, halved.matrix, atol=0.3)
     assert (half.width, half.height) == (80, 60)
+    assert twin.at_scale(0.5).camera == half and twin.at_scale(1.0).camera == twin.camera
 
 
 def test_a_size_that_enlarges_or_a_scale_beside_it_is_refused(distorted):

@@ -59,11 +59,16 @@ def test_what_is_drawn_for_a_pose_does_not_depend_on_those_that_are_dropped(rang
 
 def test_blur_that_is_drawn_needs_poses_that_follow_each_other(twin, ranges):
     blurred = ranges("effects: {motion_blur: 0.9}")
-    for spec in ("jitter", "jitter:frames=8"):
-        with pytest.raises(OptionError, match="those of jitter do not"):
-            make_job(twin, replace(along(8), spec=spec), 0, ("rgb",), "c3vd", twin.camera, blurred)
-    path = replace(along(8), spec="jitter_path.txt")
+    apart, path = replace(along(8), successive=False), replace(along(8), spec="jitter")
+    with pytest.raises(OptionError, match="those of jitter do not"):
+        make_job(twin, apart, 0, ("rgb",), "c3vd", twin.camera, blurred)
     assert make_job(twin, path, 0, ("rgb",), "c3vd", twin.camera, blurred).draws
+
+
+def test_poses_at_one_time_are_refused(twin):
+    still = replace(along(3), timestamps_s=np.array([0, 0, 1 / 30]))
+    with pytest.raises(OptionError, match="do not rise"):
+        make_job(twin, still, 0, ("rgb", "depth"), "tum", twin.camera, fixed())
 
 
 def along(count: int) -> Trajectory:

@@ -24,6 +24,7 @@ from endotwin.sequence.spread import spread
 
 GRID = 320  # pixels across the reduced images that are correlated
 REACH = 12  # reduced pixels that photo and depth may lie apart
+LEAST_SIDE = 4 * REACH  # of reduced images: of smaller ones too little stays when they are moved so far
 FRAMES = 12
 SHIFTS = (0, -1, 1, -2, 2, -3, 3, -4, 4, -5, 5)
 FLIPS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
@@ -82,7 +83,7 @@ class Registration:
 def registration(sequence: Sequence, frames: np.ndarray) -> Registration:
     """Judge a few of ``frames`` [F] and their neighbours in time."""
     stride = _stride(sequence.camera.width)
-    if min(sequence.camera.width, sequence.camera.height) <= 2 * REACH * stride:
+    if min(sequence.camera.width, sequence.camera.height) < LEAST_SIDE * stride:
         return Registration(np.nan, "none", 0, np.nan, np.full(2, np.nan), np.full(2, np.nan))
     centre = frames[spread(len(frames), FRAMES)]
     wanted = sorted({f + k for f in centre.tolist() for k in SHIFTS if 0 <= f + k < len(sequence)})

@@ -44,9 +44,6 @@ GRID = 64
 
 INSTANT = 1e-3
 
-SAME_INTERVAL = 0.01
-"""Frames whose intervals differ by a smaller share follow each other evenly."""
-
 
 @dataclass(frozen=True)
 class Shot:
@@ -138,20 +135,20 @@ def expose(film: Film, shot: Shot, effects: Ordered[ExposureEffect] = ()) -> Ten
     return total / poses
 
 
-def following(T_world_camera: np.ndarray, times_s: np.ndarray | None = None) -> np.ndarray:
+def following(T_world_camera: np.ndarray, numbers: np.ndarray | None = None) -> np.ndarray:
     """The pose one frame later of each pose [N, 4, 4] of a trajectory; the last one goes on as before.
 
-    ``times_s`` [N], where poses do not follow each other at the interval that most do; between two the camera
-    moves on one screw.
+    ``numbers`` [N] of the frames, ascending, where poses are missing: between two the camera moves on one
+    screw.
     """
     T = np.asarray(T_world_camera, np.float64)
     if len(T) < 2:
         return T.copy()
     later = T[1:].copy()
-    if times_s is not None and (steps_s := np.diff(times_s)).min() > 0:
-        share = np.median(steps_s) / steps_s
-        for k in np.flatnonzero(np.abs(share - 1) > SAME_INTERVAL):
-            later[k] = T[k] @ RigidTransform.from_exp_coords(share[k] * _screw(T[k], T[k + 1])).as_matrix()
+    if numbers is not None:
+        frames = np.diff(numbers)
+        for k in np.flatnonzero(frames > 1):
+            later[k] = T[k] @ RigidTransform.from_exp_coords(_screw(T[k], T[k + 1]) / frames[k]).as_matrix()
     return np.concatenate([later, T[-1:] @ np.linalg.inv(T[-2:-1]) @ later[-1:]])
 
 

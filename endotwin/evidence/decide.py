@@ -365,7 +365,7 @@ class _Trial:
                 "offset": "no position of one to three guides predicts better",
                 "vignetting": "with all light from the lens its profile says the same of every pixel",
                 "gain": "a single frame has no other to be brighter than",
-            }.get(name, "the photos show too little")
+            }.get(name if len(self._probe) else "", "the photos show too little")
             if self.wanted(name) == "on":
                 reason = f"asked for, but {reason}"
         self._decisions[name] = Decision("on" if on else "off", reason, gain_db)

@@ -57,9 +57,9 @@ def fuse(
 
     TSDF fusion, vertices refined against the depth maps, two rounds of carve and patch, small holes filled, a
     margin about the pictures, coverage. Noise that differs from pixel to pixel is averaged out first. As many
-    frames are in memory as SHELF_BYTES hold, and a few more. A frame without any valid depth is skipped with
-    a warning in the log ``endotwin``. Of many pixels, only the frames that see something new are fused (see
-    ``choice``).
+    frames are in memory as SHELF_BYTES hold, and a few more. A frame without any valid depth, or whose camera
+    lies beyond what the others see, is left out with a warning in the log ``endotwin``. Of many pixels, only
+    the frames that see something new are fused (see ``choice``).
 
     Args:
         frames: indices whose depth may be used; all unless given.

@@ -7,6 +7,7 @@ import logging
 import numpy as np
 from scipy.spatial import cKDTree
 
+from endotwin.fusion.mesh import joined
 from endotwin.sequence import Sequence
 
 NOISE_MOST = 0.04
@@ -15,6 +16,9 @@ NOISE_MOST = 0.04
 STRAY_DEPTHS = 5.0
 """A camera so many median distances away from the next one sees nothing of what that one sees."""
 
+STRAY_SHARE = 0.25
+"""More frames that lie together, beyond what the others see, are another part of the recording."""
+
 CONTRADICTED, AGREED = 0.5, 0.7
 """A frame is at fault if less of it agrees with the surface than this, while more of the median one does."""
 
@@ -22,24 +26,30 @@ logger = logging.getLogger("endotwin")
 
 
 def without_strays(sequence: Sequence, frames: list[int], median_mm: float) -> list[int]:
-    """``frames`` but for those, told as warnings, whose cameras lie beyond what any other sees, where
-    ``median_mm`` is the usual distance seen; all of them where most lie so."""
-    if len(frames) < 2:
-        return frames
+    """``frames`` but for those, told as warnings, whose cameras lie beyond what the others see, where
+    ``median_mm`` is the usual distance seen: alone, or in groups of at most STRAY_SHARE of all. All of them
+    where that would leave less than half."""
     positions_mm = sequence.T_world_camera[frames, :3, 3]
-    gap_mm = cKDTree(positions_mm).query(positions_mm, k=2)[0][:, 1]
-    stray = np.flatnonzero(gap_mm > STRAY_DEPTHS * median_mm)
+    cells, cell = np.unique(np.floor(positions_mm / (STRAY_DEPTHS * median_mm)), axis=0, return_inverse=True)
+    beside = cKDTree(cells).query_pairs(1.0, p=np.inf, output_type="ndarray")
+    group = joined(len(cells), beside)[cell.reshape(-1)]
+    lost = np.bincount(group)[group] <= max(STRAY_SHARE * len(frames), 1)
+    stray = np.flatnonzero(lost)
+    if len(frames) < 2 or not len(stray):
+        return frames
     if len(stray) > len(frames) / 2:
+        gap_mm = np.median(cKDTree(positions_mm).query(positions_mm, k=2)[0][:, 1])
         logger.warning(
             "the cameras of %s are %.3g mm apart but see only %.3g mm far: poses and depth seem to differ "
             "in their unit; %s",
-            *(sequence.path, np.median(gap_mm), median_mm, _remedy(sequence)),
+            *(sequence.path, gap_mm, median_mm, _remedy(sequence)),
         )
         return frames
+    others = cKDTree(positions_mm[~lost])
     for index in stray:
         logger.warning(
-            "the camera of %s is %.3g mm from any other, and left out of the surface; check its pose",
-            *(sequence.color_files[frames[index]], gap_mm[index]),
+            "the camera of %s is %.3g mm from the others, and left out of the surface; check its pose",
+            *(sequence.color_files[frames[index]], others.query(positions_mm[index])[0]),
         )
     return np.delete(frames, stray).tolist()
 

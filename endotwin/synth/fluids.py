@@ -99,7 +99,7 @@ def with_fluids(
         TwinError: the twin is not fitted. OptionError: a fluid is not understood, or finds no place.
     """
     full = f"{MOST_FLUIDS} patches of fluid lie on a twin at most; ask for fewer"
-    each = one_by_one(twin, specs, parse_fluid, MOST_FLUIDS - len(twin.fluids), full)
+    each = one_by_one(twin, specs, parse_fluid, MOST_FLUIDS - len(twin.fluids), full, "fluids")
     wall, wetted = Wall(twin, trajectory, camera or twin.camera, Caster(twin.surface)), Wetted(twin)
     for k, one in enumerate(each, len(twin.fluids)):
         _spill(wetted, wall, one[2].down(trajectory), *one, Stream.FLUID.generator(seed, k))

@@ -122,7 +122,7 @@ class Labeller:
             "polyp": numbered((each.triangles for each in twin.polyps), count),
             "fluid": covered((each.triangles for each in twin.fluids), count),
         }
-        self._T_world_next = following(job.trajectory.T_world_camera, job.trajectory.timestamps_s)
+        self._T_world_next = following(job.trajectory.T_world_camera, job.trajectory.originals)
         self._shaded: tuple[object, Renderer, Renderer | None] | None = None
 
     def frame(self, index: int, clip: Clip | None = None) -> dict[str, np.ndarray]:

@@ -61,7 +61,7 @@ def with_polyps(
     if twin.fluids:
         raise OptionError("fluids lie on this twin already; grow polyps on the one without them")
     full = f"a twin holds {MOST_POLYPS} polyps at most; ask for fewer"
-    each = one_by_one(twin, specs, parse_polyp, MOST_POLYPS - len(twin.polyps), full)
+    each = one_by_one(twin, specs, parse_polyp, MOST_POLYPS - len(twin.polyps), full, "polyps")
     garden = _Garden(twin, trajectory, camera or twin.camera)
     seedlings = [
         garden.seedling(*one, Stream.POLYP.generator(seed, k)) for k, one in enumerate(each, len(twin.polyps))

@@ -54,15 +54,17 @@ def one_by_one(
     parse: Callable[[str], tuple[str, Several]],
     room: int,
     full: str,
+    name: str,
 ) -> list[Asked]:
-    """The spec, the kind and the options of each thing that ``specs`` ask for, as ``parse`` tells them.
+    """The spec, the kind and the options of each thing that ``specs`` ask for, as ``parse`` tells them;
+    ``name``: what the specs are called.
 
     Raises:
         TwinError: the twin is not fitted. OptionError: there are more than ``room``, with the text ``full``.
     """
     if not twin.fitted:
         raise TwinError("the twin has no materials yet; run 'endotwin fit' on it first")
-    asked = [(spec, *parse(spec)) for spec in texts("what lies on the wall", specs)]
+    asked = [(spec, *parse(spec)) for spec in texts(name, specs)]
     if sum(options.count for *_, options in asked) > room:
         raise OptionError(full)
     return [one for one in asked for _ in range(one[2].count)]

@@ -270,7 +270,7 @@ class Twin:
 
     def at_scale(self, scale: float) -> Twin:
         """The same twin, seen by its camera with images of another factor of the photos' size."""
-        source = replace(self.source, scale=scale)
+        source = self.source.shrunk(scale / self.source.scale)
         written = source.open().camera
         camera = self.registration.camera(written) if self.registration else written
         return replace(self, source=source, camera=camera)

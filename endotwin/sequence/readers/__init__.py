@@ -7,9 +7,8 @@ from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 
-import numpy as np
-
 from endotwin.errors import OptionError, SequenceError
+from endotwin.run.arguments import check_whole
 from endotwin.sequence.readers import c3vd, simcol, transforms, tum
 from endotwin.sequence.sequence import Sequence
 from endotwin.sequence.undistorted import Undistorted
@@ -60,8 +59,10 @@ def open_sequence(
     sequence = reader.read(path)
     sequence.check()
     if undistort is not None:
-        if np.shape(undistort) != (2,):
+        if not isinstance(undistort, tuple | list) or len(undistort) != 2:
             raise OptionError(f"a size to undistort to is a width and a height, and not {undistort!r}")
+        for name, size in zip(("width", "height"), undistort, strict=True):
+            check_whole(f"{name} to undistort to", size, 1)
         if scale != 1:
             raise OptionError("a size to undistort to is the size of the images; leave the scale out")
         return Undistorted.of(sequence, *undistort)

@@ -251,8 +251,8 @@ def _description(file: Path, given: dict) -> dict:
         raise CameraError(
             f"{file}: 'k4' of a pinhole camera is not supported; undistort the images, or leave it out"
         )
-    fl_x = given["fl_x"] if "fl_x" in given else _focal(given.get("camera_angle_x"), given["w"])
-    fl_y = given["fl_y"] if "fl_y" in given else _focal(given.get("camera_angle_y"), given["h"]) or fl_x
+    fl_x = given["fl_x"] if "fl_x" in given else _focal(file, given.get("camera_angle_x"), given["w"])
+    fl_y = given["fl_y"] if "fl_y" in given else _focal(file, given.get("camera_angle_y"), given["h"]) or fl_x
     if not fl_x:
         raise CameraError(f"{file} has neither 'fl_x' nor 'camera_angle_x'; add the focal length in pixels")
     return {
@@ -267,7 +267,10 @@ def _description(file: Path, given: dict) -> dict:
     }
 
 
-def _focal(angle: float | None, size: float) -> float | None:
-    """Focal length in pixels of a pinhole whose image of ``size`` pixels spans ``angle`` radians; None where
-    there is no angle that an image can span."""
-    return size / 2 / tan(angle / 2) if angle and 0 < angle < pi else None
+def _focal(file: Path, angle: float | None, size: float) -> float | None:
+    """Focal length in pixels of a pinhole whose image of ``size`` pixels spans ``angle`` radians."""
+    if angle is None:
+        return None
+    if not 0 < angle < pi:
+        raise CameraError(f"{file}: a field of view of {angle:g} radians; give one between 0 and π")
+    return size / 2 / tan(angle / 2)

@@ -16,6 +16,7 @@ from endotwin.effects.video import CLIP_FRAMES, Video
 from endotwin.errors import EndotwinError, OptionError, OutputError, TwinError
 from endotwin.run.output import DATASET, check_apart, unwritable
 from endotwin.run.processes import Pool
+from endotwin.sequence.poses import TIME_DIGITS
 from endotwin.synth.encodings import FLOW_RANGE_PX
 from endotwin.synth.job import Job
 from endotwin.synth.labels import DEFAULT_LABELS, LABELS, OF_MOTION
@@ -151,6 +152,8 @@ def make_job(
     refusal = LAYOUTS[layout].refusal(camera, labels)
     if refusal:
         raise OptionError(f"layout {layout}: {refusal}")
+    if (np.diff(trajectory.timestamps_s.round(TIME_DIGITS)) <= 0).any():
+        raise OptionError("the times of the trajectory do not rise; give each pose a later one")
     draws = variation.draw(trajectory.originals, seed)
     used = {*twin.effects, *(name for draw in draws for name, on in draw.effects if on)}
     moving = [name for name in SUCCESSIVE if name in used]
@@ -253,7 +256,7 @@ def _doubt_flow(counts: dict[str, list[int]]) -> None:
     for name, (flowing, lost) in counts.items():
         if lost:
             logger.warning(
-                "%.1f %% of the %s is beyond the ±%g px of its code and lost; ask for %s_exr or %s_npz too",
+                "%.1f %% of the %s is beyond the ±%g px of its code and lost; %s_exr and %s_npz hold all of it",
                 *(100 * lost / flowing, name, FLOW_RANGE_PX, name, name),
             )
 

@@ -37,6 +37,7 @@ class Trajectory:
         spec: what was asked for. numbers: int [N], of the poses before some were dropped.
         checks: what the gate found of each pose, float64 [N] by name.
         counts: of poses asked for, redrawn and dropped. limits: that they keep.
+        successive: whether a camera goes from each pose to the next.
     """
 
     T_world_camera: np.ndarray
@@ -47,6 +48,7 @@ class Trajectory:
     checks: dict[str, np.ndarray] = field(default_factory=dict)
     counts: dict[str, int] = field(default_factory=dict)
     limits: Limits | None = None
+    successive: bool = True
 
     def __len__(self) -> int:
         return len(self.T_world_camera)
@@ -55,11 +57,6 @@ class Trajectory:
     def originals(self) -> np.ndarray:
         """``numbers``, by which is drawn what a pose is rendered with, whatever others are dropped."""
         return np.arange(len(self)) if self.numbers is None else self.numbers
-
-    @property
-    def successive(self) -> bool:
-        """Whether a camera goes from each pose to the next."""
-        return self.spec.partition(":")[0] != "jitter"
 
 
 @dataclass(frozen=True)
@@ -146,7 +143,9 @@ def kept_in(trajectory: Trajectory, twin: Twin, camera: Camera) -> Trajectory:
     kept = _kept(*words, gate, gate.judge(poses))
     dropped = trajectory.counts.get("dropped", 0) + len(poses) - len(kept)
     counts = {**trajectory.counts, "dropped": dropped}
-    return replace(kept, numbers=trajectory.originals[kept.numbers], counts=counts)
+    return replace(
+        kept, successive=trajectory.successive, numbers=trajectory.originals[kept.numbers], counts=counts
+    )
 
 
 def allowed_specs() -> str:
@@ -278,7 +277,7 @@ def _jittered(spec: str, options: JitterOptions, twin: Twin, gate: Gate, seed: i
         f"{options.rotation:g}° at random"
     )
     kept = _kept(spec, poses, frame_times(frames), description, gate, gate.judge(poses))
-    return replace(kept, counts={**kept.counts, "redrawn": redrawn})
+    return replace(kept, counts={**kept.counts, "redrawn": redrawn}, successive=False)
 
 
 def _moved(T_world_camera: np.ndarray, options: JitterOptions, generator: np.random.Generator) -> np.ndarray:
