@@ -256,7 +256,7 @@ def _doubt_flow(counts: dict[str, list[int]]) -> None:
     for name, (flowing, lost) in counts.items():
         if lost:
             logger.warning(
-                "%.1f %% of the %s is beyond the ±%g px of its code and lost; %s_exr and %s_npz hold all of it",
+                "%.1f %% of the %s is beyond the ±%g px of its code and lost; %s_exr and %s_npz hold it all",
                 *(100 * lost / flowing, name, FLOW_RANGE_PX, name, name),
             )
 
