@@ -45,6 +45,11 @@ def test_tilts_bring_the_rendering_nearer_to_photos_that_the_fit_never_saw(fitte
     assert tilted.mean("ssim_covered") > untilted.mean("ssim_covered")
 
 
+def test_effects_that_are_forced_off_are_not_judged(fitted):
+    for name in ("coat", "tone", "film", "sparkle", "gain", "interreflection", "profile", "vignetting"):
+        assert (fitted[0].decisions[name].state, fitted[0].decisions[name].reason) == ("off", "forced off")
+
+
 def test_with_the_true_materials_disturbed_normals_are_found_again():
     twin = tube_twin.fitted(tube_twin.seen(tube_twin.surface(fold_mm=2.0)))
     twin = replace(twin, materials=replace(twin.materials, metallic=0 * twin.materials.metallic))

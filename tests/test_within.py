@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import torch
 
-from endotwin.effects import Decision
 from endotwin.effects.coat import Coat
 from endotwin.effects.tone import Tone
 from endotwin.effects.vignetting import Vignetting
@@ -151,7 +150,6 @@ def test_a_hint_of_a_coat_is_enough_where_all_pixels_are_asked_next():
 def test_tissue_without_a_coat_gets_none_and_one_that_is_forced_on_weighs_nothing():
     within, material = photographed()
     assert judged(within.highlights(material, TRUE, NOISE), "auto")[0] is None
-    assert judged(within.highlights(material, TRUE, NOISE), "off") == (None, Decision("off", "forced off"))
     forced, decision = judged(within.highlights(material, TRUE, NOISE), "on")
     assert decision.state == "on" and forced.weight < 0.02
 

@@ -32,6 +32,7 @@ class Layout:
         packed: whether a shard is one tar file.
         reads: whether endotwin reads it back. root: the folder within the dataset that it reads.
         advice: what another program must be told to read it.
+        by_time: whether frames are named by their times.
     """
 
     name: str
@@ -45,6 +46,7 @@ class Layout:
     reads: bool = True
     root: str = "."
     advice: str = ""
+    by_time: bool = False
 
     def encoding(self, image: str) -> Encoding:
         """How ``image`` is written."""

@@ -47,4 +47,5 @@ LAYOUT = Layout(
     },
     {"depth": depth_png(LEVELS_PER_MM, "16-bit z-depth, raw / 5000 m (steps of 0.2 mm); 0: none")},
     needs("rgb", "depth"),
+    by_time=True,
 )

@@ -152,8 +152,8 @@ def make_job(
     refusal = LAYOUTS[layout].refusal(camera, labels)
     if refusal:
         raise OptionError(f"layout {layout}: {refusal}")
-    if (np.diff(trajectory.timestamps_s.round(TIME_DIGITS)) <= 0).any():
-        raise OptionError("the times of the trajectory do not rise; give each pose a later one")
+    if LAYOUTS[layout].by_time and (np.diff(trajectory.timestamps_s.round(TIME_DIGITS)) <= 0).any():
+        raise OptionError(f"layout {layout}: the times of the poses do not rise; give each a later one")
     draws = variation.draw(trajectory.originals, seed)
     used = {*twin.effects, *(name for draw in draws for name, on in draw.effects if on)}
     moving = [name for name in SUCCESSIVE if name in used]
