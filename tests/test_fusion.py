@@ -18,7 +18,7 @@ from endotwin.fusion import fuse
 from endotwin.fusion._open3d import o3c, o3d
 from endotwin.fusion.agreement import Tolerance, agreement
 from endotwin.fusion.faces import distance_mm, split
-from endotwin.fusion.mesh import boundary_edges, surface_of, without_short_edges
+from endotwin.fusion.mesh import boundary_edges, surface_of
 from endotwin.fusion.patch import _delaunay
 from endotwin.fusion.reconcile import reconciled
 from endotwin.fusion.views import read_views
@@ -357,14 +357,3 @@ def test_points_in_the_image_are_triangulated_as_qhull_does(seed, pixels, others
 @pytest.mark.parametrize("uv", [[[3, 3]], [[3, 3], [5, 3]], [[3, 3], [4, 4], [5, 5], [6, 6]]])
 def test_points_in_line_have_no_triangles(uv):
     assert _delaunay(np.array(uv, float)).shape == (0, 3)
-
-
-@pytest.mark.parametrize("flipped", [False, True])
-def test_short_edges_within_a_mesh_are_joined_whichever_way_triangles_run_and_its_border_stays(flipped):
-    """Two squares, their common side a thousandth long; and at the border one as short."""
-    vertices_mm = np.float32([[0, 0, 0], [1, 0, 0], [1, 1e-3, 0], [0, 1, 0], [2, 1, 0], [0, 1.001, 0]])
-    triangles = np.int32([[0, 1, 2], [0, 2, 3], [2, 1, 4], [3, 2, 5]])
-    triangles = triangles[:, ::-1] if flipped else triangles
-    joined_mm, kept = without_short_edges(vertices_mm, triangles, 0.01)
-    assert len(joined_mm) == 5 and len(kept) == 2
-    np.testing.assert_allclose(np.sort(joined_mm[:, 1]), [0, 5e-4, 1, 1, 1.001])
