@@ -5,8 +5,10 @@ measures on this machine, in about a minute.
 """
 
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
+from endotwin.effects import NAMES, effect_class
 from endotwin.selfcheck import run_checks
 from endotwin.selfcheck.finding import shown
 from endotwin.synth import LABELS, LAYOUTS
@@ -23,6 +25,15 @@ FORMATS = """# What a dataset holds
 
 `--labels` takes names joined by commas, or `all`; nothing else is computed. A layout may write a label in
 another way, which is said below.
+
+"""
+
+PARAMETERS = """
+## Parameters of effects
+
+What `parameters:` of `--vary` edits, with `*`, `+`, `-` or `=` and a number or a range, where the effect is
+on. What a twin's effects have is in its `twin.json`; the defaults are of effects that are switched on and
+that the photos of the twin's sequence do not tell.
 
 """
 
@@ -57,7 +68,18 @@ def formats() -> str:
         words |= {"read back": "by endotwin"} if layout.reads else {}
         words |= {"advice": layout.advice} if layout.advice else {}
         page += f"\n### `{layout.name}`\n\n" + "".join(f"- {name}: {text}\n" for name, text in words.items())
-    return page + "\n## In every layout\n\n" + "".join(f"- {text}\n" for text in COMMON_WORDS.values())
+    page += "\n## In every layout\n\n" + "".join(f"- {text}\n" for text in COMMON_WORDS.values())
+    return page + PARAMETERS + table(("parameter", "default", "least", "most"), list(_parameters()))
+
+
+def _parameters() -> Iterator[tuple[str, ...]]:
+    """Name, default and bounds of each parameter of the effects that have defaults for all."""
+    for name in NAMES:
+        if parameters := effect_class(name).parameters():
+            effect = effect_class(name)()
+            for each in parameters:
+                numbers = (getattr(effect, each.name), each.low, each.high)
+                yield f"`{name}.{each.name}`", *(f"{number:.4g}" for number in numbers)
 
 
 def numerics() -> str:
