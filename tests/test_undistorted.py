@@ -55,7 +55,7 @@ def test_a_twin_of_undistorted_frames_opens_them_so_again(distorted, tmp_path):
     again = endotwin.Twin.load(tmp_path / "twin")
     assert again.sequence().camera == twin.camera
     np.testing.assert_array_equal(again.sequence().color(2), twin.sequence().color(2))
-    half, halved = twin.source.shrunk(0.5).open().camera, twin.camera.scaled(0.5)
+    half, halved = twin.source.at_scale(0.5).open().camera, twin.camera.scaled(0.5)
     np.testing.assert_allclose(half.matrix, halved.matrix, atol=0.3)
     assert (half.width, half.height) == (80, 60)
     assert twin.at_scale(0.5).camera == half and twin.at_scale(1.0).camera == twin.camera

@@ -89,7 +89,8 @@ class Aligner:
     """
 
     def __init__(self, twin: Twin, caster: Caster, progress: Progress | None):
-        self.sequence: Sequence = twin.source.shrunk(min(1.0, WIDTH / twin.camera.width)).open()
+        scale = min(1.0, WIDTH / twin.camera.width) * twin.source.scale
+        self.sequence: Sequence = twin.source.at_scale(scale).open()
         training = np.array(twin.source.training(len(self.sequence)))
         self.frames = training[spread(len(training), PHOTOS)]
         judging = np.arange(len(self.frames)) % JUDGES == JUDGES // 2

@@ -12,7 +12,7 @@ from endotwin.check.findings import Finding
 from endotwin.errors import CameraError, SequenceError
 from endotwin.sequence import Sequence
 from endotwin.sequence.images import read_color, read_plane
-from endotwin.sequence.poses import AXES_OPENGL_OPENCV, RIGID_TOLERANCE, is_rigid, poses_as_written
+from endotwin.sequence.poses import AXES_OPENGL_OPENCV, RIGID_TOLERANCE, is_rigid, poses_as_written, rigid
 from endotwin.sequence.readers import FORMATS, open_sequence, transforms
 
 
@@ -100,7 +100,8 @@ def _rigid(sequence: Sequence) -> tuple[Sequence, list[Finding]]:
     if is_rigid(transposed).all():
         says = "The pose matrices are written transposed (their translation stands in the wrong place)."
         change = f"Transpose every 4×4 matrix in {files.poses}: rows as columns."
-        return _with_poses(sequence, transposed), [Finding("poses_transposed", says, change, files.poses)]
+        finding = Finding("poses_transposed", says, change, files.poses)
+        return replace(sequence, T_world_camera=rigid(transposed, str)), [finding]
     factor = np.cbrt(np.abs(np.linalg.det(T[:, :3, :3])))
     if not np.isfinite(factor).all() or factor.min() < 1e-6:
         raise SequenceError("not rigid")
@@ -117,9 +118,7 @@ def _rigid(sequence: Sequence) -> tuple[Sequence, list[Finding]]:
         says = "The poses are left-handed: their rotations have determinant −1."
         change = f"Mirror one axis of the world in {files.poses}: negate one of the first three rows."
         findings.append(Finding("poses_left_handed", says, change, files.poses))
-    if not is_rigid(scaled).all():
-        raise SequenceError("not rigid")
-    return _with_poses(sequence, scaled), findings
+    return replace(sequence, T_world_camera=rigid(scaled, str)), findings
 
 
 def _paired(sequence: Sequence) -> tuple[Sequence, list[Finding]]:
@@ -150,11 +149,3 @@ def _sized(sequence: Sequence) -> tuple[Sequence, list[Finding], tuple[int, int]
     says = f"The calibration is of {size[0]}×{size[1]} images, but the photos are {width}×{height}."
     finding = Finding("intrinsics_size", says, "", file)
     return replace(sequence, camera=camera, image_size=(width, height)), [finding], size
-
-
-def _with_poses(sequence: Sequence, T: np.ndarray) -> Sequence:
-    left, _, right = np.linalg.svd(T[:, :3, :3])
-    T = T.copy()
-    T[:, :3, :3] = left @ right
-    T[:, 3] = (0, 0, 0, 1)
-    return replace(sequence, T_world_camera=T)

@@ -43,6 +43,7 @@ from endotwin.run.output import check_picture
 from endotwin.sequence import Frame, Sequence
 from endotwin.sequence.images import write_png
 from endotwin.sequence.readers import open_sequence
+from endotwin.sequence.readers.transforms import MARK
 from endotwin.surface import Surface
 from endotwin.surface.casting import Caster, Correspondences
 from endotwin.twin import Light, Source, Twin, as_twin
@@ -448,4 +449,4 @@ def _to_be_scored(
 def _folder(path: Path) -> Path:
     """What a sequence is in, whether that or the ``transforms.json`` there was named."""
     path = path.resolve()
-    return path.parent if path.name == "transforms.json" else path
+    return path.parent if path.name == MARK else path

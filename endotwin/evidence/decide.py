@@ -361,11 +361,13 @@ class _Trial:
         elif verdict is not None:
             reason = f"does not predict held-out pixels better ({verdict})"
         else:
-            reason = {
+            known = {
                 "offset": "no position of one to three guides predicts better",
                 "vignetting": "with all light from the lens its profile says the same of every pixel",
                 "gain": "a single frame has no other to be brighter than",
-            }.get(name if len(self._probe) else "", "the photos show too little")
+            }
+            unknown = "the photos show too little"
+            reason = known.get(name, unknown) if len(self._probe) else unknown
             if self.wanted(name) == "on":
                 reason = f"asked for, but {reason}"
         self._decisions[name] = Decision("on" if on else "off", reason, gain_db)

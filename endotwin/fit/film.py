@@ -21,6 +21,7 @@ from endotwin.fit.by_pixels import by_pixels
 from endotwin.fit.glints import Glints, Lobes, gains_in_other_photos_db
 from endotwin.fit.heal import REACH_PX, healed
 from endotwin.fit.lighting import lit
+from endotwin.fit.tilt import falling_on
 from endotwin.light.film import Film
 from endotwin.pixels.samples import Samples, frame_samples
 from endotwin.run.ahead import ahead
@@ -56,7 +57,8 @@ class Found:
 
 
 def film(model: Model, samples: Samples, wanted: str, report: Report) -> Found:
-    """The film that the photos call for, or that is ``wanted`` (auto, on or off); and why."""
+    """The film that the photos call for, or that is ``wanted`` (auto, on or off); and why. Light may have
+    fallen on ``samples`` before the model's normals were tilted."""
     if wanted == "off":
         return Found(unjudged(wanted), model)
     began = time.perf_counter()
@@ -64,7 +66,8 @@ def film(model: Model, samples: Samples, wanted: str, report: Report) -> Found:
     def decided(state: str, reason: str, gain_db: float) -> Decision:
         return Decision(state, reason, round(gain_db, 3), round(time.perf_counter() - began, 3))
 
-    judges = model.based(samples.thinned(JUDGES, np.random.default_rng(0)))
+    some = samples.thinned(JUDGES, np.random.default_rng(0))
+    judges = model.based(falling_on(model.twin.surface, some, model.relighting.effects))
     most_db = judges.most_db()
     if not judges.shines.any() or (wanted == "auto" and most_db < LEAST_DB):
         return Found(decided("off", f"glints beyond the model cost {most_db:.2f} dB", most_db), model)

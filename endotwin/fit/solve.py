@@ -34,7 +34,7 @@ from endotwin.fit.lighting import Relighting
 from endotwin.fit.prior import unusual
 from endotwin.fit.sparkle import sparkle
 from endotwin.fit.state import State
-from endotwin.fit.tilt import Tilter, falling_on
+from endotwin.fit.tilt import Tilter
 from endotwin.fit.unexplained import Remains, odd_photos_warning, residual_warning
 from endotwin.light.film import Film
 from endotwin.light.guides import AT_LENS
@@ -107,7 +107,6 @@ def fit_twin(
         state, normals, remains = fit.detail(lighted, samples)
         state = extended(state, surface, samples)
         twin = replace(twin, surface=replace(surface, normals=normals))
-        samples = falling_on(twin.surface, samples, relighting.effects)
     wet, beyond, why = fit.beyond(Model(twin, state, relighting, fit.caster), samples)
     if odd := unusual(state.shared):
         logger.warning(

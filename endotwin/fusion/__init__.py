@@ -23,6 +23,7 @@ from endotwin.fusion.smooth import smoothed
 from endotwin.fusion.tsdf import footprint_voxel_mm, fuse_tsdf
 from endotwin.fusion.views import Shelf, View, read_views
 from endotwin.fusion.wall import with_wall
+from endotwin.run.arguments import check_positive
 from endotwin.sequence import Sequence
 from endotwin.sequence.spread import spread
 from endotwin.surface import Surface
@@ -78,9 +79,9 @@ def fuse(
     photo_frames = frames if photo_frames is None else list(photo_frames)
     if not frames:
         raise OptionError("No frames are left to fuse; choose at least one.")
-    for what, value in ((f"voxel size is {voxel_mm} mm", voxel_mm), (f"factor on voxels is {voxel}", voxel)):
-        if value is not None and not value > 0:
-            raise OptionError(f"The {what}, but must be greater than 0.")
+    check_positive("factor on voxels", voxel)
+    if voxel_mm is not None:
+        check_positive("voxel size in mm", voxel_mm)
     sequence.require_valid_depth()
     camera, sample = sequence.camera, [frames[k] for k in spread(len(frames), SAMPLED_FRAMES)]
 

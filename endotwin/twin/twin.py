@@ -154,11 +154,11 @@ class Source:
         """The sequence, of which the frames that are left out are not looked at."""
         return sequence if self.split is None else replace(sequence, split=self.split)
 
-    def shrunk(self, factor: float) -> Source:
-        """The same source, its images ``factor`` times as large."""
+    def at_scale(self, scale: float) -> Source:
+        """The same source, its images ``scale`` times as large as the photos or as they were resampled to."""
         if self.undistort is None:
-            return replace(self, scale=factor * self.scale)
-        width, height = (round(factor * size) for size in self.undistort)
+            return replace(self, scale=scale)
+        width, height = (round(scale * size) for size in self.undistort)
         return replace(self, undistort=(width, height))
 
     def heldout(self, count: int) -> list[int]:
@@ -270,7 +270,7 @@ class Twin:
 
     def at_scale(self, scale: float) -> Twin:
         """The same twin, seen by its camera with images of another factor of the photos' size."""
-        source = self.source.shrunk(scale / self.source.scale)
+        source = self.source.at_scale(scale)
         written = source.open().camera
         camera = self.registration.camera(written) if self.registration else written
         return replace(self, source=source, camera=camera)

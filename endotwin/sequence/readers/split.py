@@ -80,6 +80,12 @@ def of_lists(listing: Listing) -> Split | None:
     return Split(tuple(sorted(training)), tuple(sorted(heldout)))
 
 
+def as_lists(listings: list[Listing]) -> dict[str, list[str]]:
+    """The lists of file names by which one file says the split of two, as ``of_files`` tells it."""
+    names = ([frame["file_path"] for frame in listing.frames] for listing in listings)
+    return dict(zip((TRAINING, HELD_OUT), names, strict=True))
+
+
 def _named(listing: Listing, key: str) -> set[int]:
     """Indices of the frames that the list ``key`` names."""
     names = listing.content[key]

@@ -36,9 +36,7 @@ from endotwin.sequence.poses import (
     transforms_pose_unit_mm,
     transforms_unit_mm,
 )
-from endotwin.sequence.readers.split import HELD_OUT as HELD_OUT_LIST
-from endotwin.sequence.readers.split import TRAINING as TRAINING_LIST
-from endotwin.sequence.readers.split import Listing, joined, of_files, of_lists
+from endotwin.sequence.readers.split import Listing, as_lists, joined, of_files, of_lists
 from endotwin.sequence.sequence import Sequence
 
 MARK = "transforms.json"
@@ -101,8 +99,7 @@ def write_poses(path: Path, sequence: Sequence) -> None:
     ]
     content = {**listings[0].content, "frames": frames}
     if len(listings) > 1:
-        names = ([frame["file_path"] for frame in listing.frames] for listing in listings)
-        content |= dict(zip((TRAINING_LIST, HELD_OUT_LIST), names, strict=True))
+        content |= as_lists(listings)
     path.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
 
 
