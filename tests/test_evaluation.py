@@ -197,6 +197,14 @@ def test_no_picture_stands_for_two_photos(tmp_path, caplog):
     assert "taken in order" in caplog.text
 
 
+def test_two_pictures_called_alike_are_told_apart_by_nobody(tmp_path):
+    for name in ("0000_color.jpg", "0000_color.png", "0008_color.png"):
+        (tmp_path / name).touch()
+    photos = SimpleNamespace(color_files=[Path(f"{k:04d}_color.png") for k in range(9)])
+    with pytest.raises(SequenceError, match=r"0000_color\.jpg and 0000_color\.png"):
+        rendered_files(tmp_path, photos, [0, 8])
+
+
 def test_a_render_that_is_missing_or_of_another_size_is_told(twin, tmp_path):
     _renders(twin, tmp_path / "theirs", ("0000_color.png", "0008_color.png"))
     cv2.imwrite(str(tmp_path / "theirs" / "0008_color.png"), np.zeros((5, 7, 3), np.uint8))

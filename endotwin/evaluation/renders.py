@@ -36,6 +36,9 @@ def rendered_files(folder: Path, sequence: Sequence, frames: Indices[int]) -> di
         key=lambda file: natural_order(file.name),
     )
     by_stem, by_number = {file.stem: file for file in found}, {_number(file): file for file in found}
+    if twins := [file for file in found if by_stem[file.stem] != file]:
+        other = by_stem[twins[0].stem].name
+        raise SequenceError(f"{twins[0]} and {other} show the same frame; remove one of them")
     rules = [{index: by_stem.get(sequence.color_files[index].stem) for index in frames}]
     if len(by_number) == len(found):
         rules.append({index: by_number.get(_number(sequence.color_files[index])) for index in frames})

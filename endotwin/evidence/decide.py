@@ -295,10 +295,21 @@ class _Trial:
 
     def _worth_within(self, names: frozenset[str], name: str, verdict: Verdict) -> bool:
         model = self._model(names)
-        if name != "offset":
-            return worth(name, verdict, model)
-        found = worth(name, verdict, model) and self._borne_out(model, verdict)
-        return found or self._ground.certain(model, verdict)
+        found = worth(name, verdict, model)
+        if name == "gain":
+            return found and self._no_uneven_bounce(names)
+        if name == "offset":
+            return (found and self._borne_out(model, verdict)) or self._ground.certain(model, verdict)
+        return found
+
+    def _no_uneven_bounce(self, names: frozenset[str]) -> bool:
+        """Whether the gain among ``names`` explains more than bounced light of another strength in each frame
+        would: that from a mesh of what was seen errs so, by less where less of a pixel's light is bounced."""
+        without = self._model(names - {"gain"}).hypothesis
+        if without.bounced is None:
+            return True
+        uneven = self._probe.fit(replace(without, uneven=True))
+        return self._probe.compare(uneven, self._model(names)).sigmas >= MIN_SIGMAS
 
     def _borne_out(self, model: Fitted, verdict: Verdict) -> bool:
         """Whether guides of ``model`` gain more, by their ``verdict``, than a bounce errs by, or cast shadows
@@ -358,6 +369,8 @@ class _Trial:
                 )
             elif not forced and verdict.gain_db < 0:
                 reason = f"certain beside guides, and no held-out pixels plainly contradict it ({verdict})"
+        elif verdict is not None and verdict.keep:
+            reason = f"bounced light that is a little off would explain as much ({verdict})"
         elif verdict is not None:
             reason = f"does not predict held-out pixels better ({verdict})"
         else:

@@ -21,6 +21,9 @@ TISSUE_BOUNDS = ((0.0, math.log(0.02 / 0.9), 0.15), (2.0, math.log(0.05 / 0.25),
 """Retro-reflection from Lambert's lobe to that of Burley's roughest tissue; f0 from water's to more than
 a dielectric's, on pale tissue and on dark; no mirror and no chalk."""
 
+LIGHT_COLUMNS = 6
+"""Of light and tissue: γn, γq, γ, and three of the tissue's answer."""
+
 ASIDE = 0.02
 """Roughness by which its derivative is taken."""
 
@@ -117,7 +120,8 @@ class LogLight:
 
     def columns(self, about: About, vertex: np.ndarray) -> np.ndarray:
         """Columns [N, 6] at places of vertices [N], linearised; their coefficients are γn, γq, γ, and γ times
-        what retro, log_gloss and roughness of the tissue are more than ``about`` has them."""
+        what retro, log_gloss and roughness of the tissue are more than ``about`` has them. Where light
+        bounces there is a seventh: of γ times the change of the bounce's ln."""
         n, q, tissue = about.n, about.q, about.tissue
         axis, distance = self.lit.guides.log_axis.numpy(), self.lit.guides.log_distance.numpy()
         lobe, by_roughness = self._lobe(tissue.roughness)
@@ -138,8 +142,9 @@ class LogLight:
         if self.bounced is not None:
             by_n += share[:, -1] * self.bounced.by_n
             by_q += share[:, -1] * self.bounced.by_q
+        by_bounce = [] if self.bounced is None else [share[:, -1]]
         level = top[:, 0] + np.log(total)
-        return np.stack([by_n, by_q, level - n * by_n - q * by_q, *by_tissue], axis=1)
+        return np.stack([by_n, by_q, level - n * by_n - q * by_q, *by_tissue, *by_bounce], axis=1)
 
     def _lobe(self, roughness: float) -> tuple[np.ndarray, np.ndarray]:
         """The specular lobe [N, K] per unit of f0, and the derivative of its logarithm by roughness."""

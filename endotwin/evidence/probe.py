@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
-from endotwin.evidence.log_light import TISSUE_MEAN, About, Bounced, LogLight, Tissue
+from endotwin.evidence.log_light import LIGHT_COLUMNS, TISSUE_MEAN, About, Bounced, LogLight, Tissue
 from endotwin.evidence.sightings import Sightings
 from endotwin.evidence.verdict import Halved, Verdict, compared, verdict_of
 from endotwin.light.forward import Lit
@@ -45,6 +45,10 @@ observation a vertex: what the model lacks errs alike in all pixels of one."""
 ALBEDO_RANGE = 5.0
 """Albedos are told to within this factor of the median: enough for how much their lobes stand out."""
 
+UNEVEN_SPREAD = 0.3
+"""Prior of ln of a frame's own bounce: what it was found to err by between frames is a tenth of that at most,
+so that the photos tell it."""
+
 HELD = 1e-6
 """Spread of what is not to move."""
 
@@ -63,7 +67,12 @@ LEAST_COS = 0.02
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """A model of the light: which effects it has."""
+    """A model of the light: which effects it has.
+
+    Attributes:
+        uneven: whether bounced light is of another strength in each frame, as no scene's is, but what stands
+            for it may be.
+    """
 
     guides_mm: tuple[tuple[float, float, float], ...] = AT_LENS
     shadows: bool = False
@@ -71,6 +80,7 @@ class Hypothesis:
     gain: bool = False
     vignetting: bool = False
     bounced: Bounced | None = None
+    uneven: bool = False
 
 
 @dataclass(frozen=True)
@@ -252,6 +262,9 @@ class Probe(Sightings):
         mean, spread = [*LIGHT_MEAN, *moved], [*LIGHT_SPREAD, *spread]
         if hypothesis.vignetting:
             mean, spread = [*mean, 0.0], [*spread, VIGNETTING_SPREAD]
+        if hypothesis.uneven:
+            count = len(self.frames)
+            mean, spread = [*mean, *[0.0] * count], [*spread, *[PRIOR["gamma"] * UNEVEN_SPREAD] * count]
         precision = len(self) / max(self.count, 1) / np.square(spread)
         return Design(
             _columns(self, hypothesis, light, about),
@@ -264,9 +277,13 @@ class Probe(Sightings):
 
 
 def _columns(sightings: Sightings, hypothesis: Hypothesis, light: LogLight, about: About) -> np.ndarray:
-    """Those of the light, and of vignetting where there is any."""
-    columns = light.columns(about, sightings.vertex)
-    return np.c_[columns, sightings.vignetting_column] if hypothesis.vignetting else columns
+    """Those of the light, of vignetting, and of each frame's bounce, where there are any."""
+    columns, by_bounce = np.split(light.columns(about, sightings.vertex), [LIGHT_COLUMNS], axis=1)
+    if hypothesis.vignetting:
+        columns = np.c_[columns, sightings.vignetting_column]
+    if hypothesis.uneven:
+        columns = np.c_[columns, by_bounce * (sightings.frame[:, None] == np.arange(len(sightings.frames)))]
+    return columns
 
 
 def log_light(sightings: Sightings, hypothesis: Hypothesis, visible: np.ndarray | None = None) -> LogLight:

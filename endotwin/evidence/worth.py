@@ -32,11 +32,6 @@ place though poses that are off leave so much of the photos that it is less than
 as they are and with poses .1 mm and .06° off, it explained 0.0016 to 0.0059 where the lens vignettes, but for
 three on which that hardly shows, and 0.0012 at most where it does not."""
 
-LEAST_GAIN, PLAIN_DB = 0.08, 3.0
-"""Standard deviation of ln gain below which, beside bounced light, it is none, unless it leaves half of the
-loss: the bounce from a mesh of what was seen errs by some 4 % of a frame's brightness. An automatic gain
-changes it by tens."""
-
 LIKELIER = 2.0
 """Nats by which a bounce has to make light and response likelier where pixels do not tell, such as those of
 two standard deviations: a gain of each frame can explain what bounces as well, but with another γ."""
@@ -46,8 +41,6 @@ def worth(name: str, verdict: Verdict, model: Fitted) -> bool:
     """Whether the effect ``name`` of ``model`` is worth its place by the ``verdict`` on that beside the same
     without it."""
     bounces = model.hypothesis.bounced is not None
-    if name == "gain" and bounces and verdict.gain_db < PLAIN_DB:
-        return verdict.keep and float(model.log_gain.std()) >= LEAST_GAIN
     if name == "vignetting":
         plain = verdict.worth(Verdict(0.0, LEAST.sigmas)) and explained(verdict, model) >= ROUNDING
         return plain or verdict.worth(LEAST)

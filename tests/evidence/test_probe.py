@@ -14,7 +14,7 @@ from endotwin.evidence.bounce import Surroundings
 from endotwin.evidence.light_map import LightMap, places_mm
 from endotwin.evidence.probe import LEAST_COS, Hypothesis, Probe, log_light
 from endotwin.evidence.sightings import Sightings
-from endotwin.evidence.verdict import verdict_of
+from endotwin.evidence.verdict import MIN_SIGMAS, Verdict, verdict_of
 from endotwin.evidence.worth import LEAST
 from endotwin.pipeline import fuse_twin
 from endotwin.pixels.pace import Pace
@@ -63,6 +63,29 @@ def test_a_rough_lobe_bends_no_light_and_passes_for_no_other_effect(example, rou
     others = (Hypothesis(gain=True), Hypothesis(profile=1.0), BESIDE)
     assert not any(probe.compare(plain, probe.fit(each)).keep for each in others)
     assert not probe.compare(plain, probe.fit(Hypothesis(vignetting=True))).worth(LEAST)
+
+
+def test_a_gain_and_a_bounce_that_errs_from_frame_to_frame_are_told_apart(example):
+    """As strong as they pass for each other: each is the better model of what it made itself."""
+    even = Hypothesis(bounced=Surroundings(example).bounced(Hypothesis()))
+    rng, light = np.random.default_rng(2), log_light(example, even)
+    albedo, direct, bounced = (
+        rng.normal(0, 0.2, example.count),
+        light.irradiance(2, 2),
+        np.exp(light.bounced.log),
+    )
+    wander = np.sin(np.arange(len(example.frames)))[example.frame]
+
+    def verdict(log_gain: float, log_bounce: float) -> Verdict:
+        lit = copy.copy(example)
+        log_lit = np.log(direct + bounced * np.exp(log_bounce * wander)) + log_gain * wander
+        lit.target = (albedo[example.vertex] + log_lit) / 2.2 + rng.normal(0, 0.01, len(example))
+        gain, uneven = (lit.fit(replace(even, **{name: True})) for name in ("gain", "uneven"))
+        assert lit.compare(lit.fit(even), gain).keep
+        return lit.compare(uneven, gain)
+
+    assert verdict(log_gain=0.04, log_bounce=0).sigmas > MIN_SIGMAS
+    assert verdict(log_gain=0, log_bounce=0.15).sigmas < -MIN_SIGMAS
 
 
 @pytest.mark.parametrize(

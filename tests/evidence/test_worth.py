@@ -11,25 +11,16 @@ from endotwin.evidence.verdict import Verdict
 from endotwin.evidence.worth import worth
 
 
-def model(bounces: bool, varies: float = 0.0, leaves: float = 0.005) -> SimpleNamespace:
-    """What is asked of a fitted model: whether light bounces, ln of two frames' gains, and what it leaves."""
+def model(bounces: bool, leaves: float = 0.005) -> SimpleNamespace:
+    """What is asked of a fitted model: whether light bounces, and what it leaves."""
     hypothesis = Hypothesis(bounced=object() if bounces else None)
-    effects = SimpleNamespace(width=leaves)
-    return SimpleNamespace(hypothesis=hypothesis, log_gain=varies * np.array([-1.0, 1.0]), effects=effects)
+    return SimpleNamespace(hypothesis=hypothesis, effects=SimpleNamespace(width=leaves))
 
 
 def test_guides_that_gain_little_are_worth_their_place_only_where_no_light_bounces():
     little, usual = Verdict(0.06, 6), Verdict(0.25, 4)
     assert worth("offset", little, model(bounces=False)) and not worth("offset", little, model(bounces=True))
     assert worth("offset", usual, model(bounces=True))
-
-
-def test_beside_a_bounce_a_gain_has_to_vary_as_a_cameras_does_or_to_explain_half_of_all():
-    usual, plain = Verdict(0.5, 10), Verdict(3.5, 10)
-    assert worth("gain", usual, model(bounces=False, varies=0.02))
-    assert not worth("gain", usual, model(bounces=True, varies=0.02))
-    assert worth("gain", usual, model(bounces=True, varies=0.1))
-    assert worth("gain", plain, model(bounces=True, varies=0.02))
 
 
 def test_vignetting_that_explains_more_than_rounding_is_worth_its_place_however_much_is_left():
