@@ -12,7 +12,7 @@ from endotwin.evidence.glints import MOST_GUIDES, Glints
 from endotwin.evidence.light_map import LightMap, places_mm
 from endotwin.evidence.probe import Fitted, Hypothesis, Probe
 from endotwin.evidence.verdict import Verdict
-from endotwin.evidence.worth import hints_at_guides, worth
+from endotwin.evidence.worth import hints_at_guides, worth, worth_another
 from endotwin.light.guides import AT_LENS
 from endotwin.pixels.fixed_effects import Design, Left
 
@@ -117,9 +117,11 @@ def found_guides(ground: Ground, base: Hypothesis, forced: bool, near_mm: Guides
             best, first = found, told + 1
     for number in range(first, MOST_GUIDES + 1):
         found = under(search.best(number))
-        better = worth("offset", probe.compare(best or plain, found), found)
-        if better and best is not None:
-            better = worth("offset", probe.compare(settled(ground, best), found), found)
+        if best is None:
+            better = worth("offset", probe.compare(plain, found), found)
+        else:
+            better = worth_another(probe.compare(best, found), found)
+            better = better and worth_another(probe.compare(settled(ground, best), found), found)
         if better or (forced and best is None and number == MOST_GUIDES):
             best = found
     return AT_LENS if best is None else Search(ground.part, best.hypothesis).settled()
