@@ -4,11 +4,12 @@ coefficients.
 One effect can pass for another: a gain of each frame swallows most of a bounce that is left out, a vignetting
 a guide. So where the light stands, whether it bounces and whether the camera's gain changes are decided
 together: of all combinations the one that predicts best, less what is not worth its place beside the rest.
-Profile and vignetting, which say little, follow beside what was kept.
+Profile and vignetting, which say little and nearly the same, follow beside what was kept.
 """
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
@@ -82,7 +83,7 @@ def decide(
     trial = _Trial(probe, glints, wanted, late, near_mm)
     kept = trial.together()
     kept = trial.shadowed(kept)
-    for name in BESIDE:
+    for name in trial.stronger_first(kept):
         kept = trial.beside(name, kept)
     return trial.decided(trial.polished(trial.without_idle_gain(kept)))
 
@@ -177,15 +178,27 @@ class _Trial:
         self._say("shadows", on, verdict)
         return kept if on else unshadowed
 
+    def stronger_first(self, kept: Fitted) -> list[str]:
+        """Profile and vignetting, first the one that explains more beside ``kept``: they say nearly the same,
+        and either would take the other's place."""
+
+        def gain_db(name: str) -> float:
+            began = time.perf_counter()
+            verdict = self._verdict_beside(name, kept, self._with(name, kept))
+            self._seconds[name] += time.perf_counter() - began
+            return verdict.gain_db if verdict.possible else -math.inf
+
+        tried = [name for name in BESIDE if self._tried(name, kept)]
+        return sorted(BESIDE, key=gain_db, reverse=True) if tried == list(BESIDE) else list(BESIDE)
+
     def beside(self, name: str, kept: Fitted) -> Fitted:
         """``kept`` with profile or vignetting beside it, if it is worth that, and its guides moved to where
         they then predict best."""
-        if self.wanted(name) == "off" or not self._tellable(name, kept):
+        if not self._tried(name, kept):
             self._say(name, False, None)
             return kept
         began = time.perf_counter()
-        other = self._mixed(kept) if name == "profile" else replace(kept.hypothesis, vignetting=True)
-        other = self._probe.fit(other)
+        other = self._with(name, kept)
         verdict = self._verdict_beside(name, kept, other)
         on = self.wanted(name) == "on" or worth(name, verdict, other)
         if on and other.hypothesis.guides_mm != AT_LENS:
@@ -195,6 +208,14 @@ class _Trial:
         self._say(name, on, verdict)
         self._seconds[name] += time.perf_counter() - began
         return other if on else kept
+
+    def _tried(self, name: str, kept: Fitted | None) -> bool:
+        return self.wanted(name) != "off" and self._tellable(name, kept)
+
+    def _with(self, name: str, kept: Fitted) -> Fitted:
+        """``kept`` with profile or vignetting beside it."""
+        other = self._mixed(kept) if name == "profile" else replace(kept.hypothesis, vignetting=True)
+        return self._probe.fit(other)
 
     def _verdict_beside(self, name: str, kept: Fitted, other: Fitted) -> Verdict:
         """On ``other``, which has the effect ``name`` as well. No endoscope's lens brightens the rim."""
@@ -328,8 +349,7 @@ class _Trial:
 
     def _beside_kept(self, name: str, kept: frozenset[str]) -> Verdict | None:
         """What an effect that is off would gain; None where that was not tried."""
-        tried = self.wanted(name) != "off" and self._tellable(name, None)
-        if not tried or (name == "offset" and not self._beside_lens):
+        if not self._tried(name, None) or (name == "offset" and not self._beside_lens):
             return None
         return self._verdict(kept, kept | {name})
 
@@ -372,7 +392,8 @@ class _Trial:
         elif verdict is not None and verdict.keep:
             reason = f"bounced light that is a little off would explain as much ({verdict})"
         elif verdict is not None:
-            reason = f"does not predict held-out pixels better ({verdict})"
+            hardly = "hardly predicts" if verdict.gain_db > 0 else "does not predict"
+            reason = f"{hardly} held-out pixels better ({verdict})"
         else:
             known = {
                 "offset": "no position of one to three guides predicts better",

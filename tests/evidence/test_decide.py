@@ -298,6 +298,29 @@ def test_a_bounce_that_gains_make_up_for_is_told_by_how_usual_light_and_response
     assert trial._decisions["interreflection"].state == state
 
 
+@pytest.mark.parametrize(
+    ("exponential_db", "vignetting_db", "first"),
+    [(0.3, 0.4, "vignetting"), (0.4, 0.3, "profile"), (0.3, None, "profile")],
+)
+def test_of_profile_and_vignetting_the_one_that_explains_more_is_decided_first(
+    example, monkeypatch, exponential_db, vignetting_db, first
+):
+    """Which may lose a place that it had only as long as the other was not tried."""
+    twin, caster, samples, glints = example
+
+    def compared(probe, base, other) -> Verdict:
+        vignettes, brightens = other.hypothesis.vignetting, vignetting_db is None
+        return Verdict(
+            (vignetting_db or 1.0) if vignettes else exponential_db, 5, not (vignettes and brightens)
+        )
+
+    monkeypatch.setattr(Probe, "compare", compared)
+    probe = Probe(samples, twin, caster)
+    trial = _Trial(probe, glints, {}, lambda: False, AT_LENS)
+    kept = probe.fit(Hypothesis(((3.0, 0.0, 0.0),)))
+    assert trial.stronger_first(kept)[0] == first
+
+
 def test_light_and_response_are_as_unusual_as_they_are_far_from_what_is_usual(example):
     twin, caster, samples, _ = example
     found = Probe(samples, twin, caster).fit(Hypothesis())
