@@ -20,13 +20,17 @@ sys.path.append(str(Path(__file__).parent))
 
 from decisions import EFFECTS, fitted
 
+ANGULAR = ("profile", "vignetting")
+"""Say the same of a light at the lens, and are not counted there unless light bounces."""
+
 
 def row(folder: Path) -> str:
     """A line of the table."""
     made = json.loads((folder / "truth" / "made.json").read_text(encoding="utf-8"))
     fit, true = fitted(folder, made, None), made["effects"]
-    wrong = [f"−{name}" for name in true if name not in fit.on]
-    wrong += [f"+{name}" for name in EFFECTS if name in fit.on and name not in true]
+    told = [name for name in EFFECTS if name not in ANGULAR or {"offset", "interreflection"} & {*true}]
+    wrong = [f"−{name}" for name in told if name in true and name not in fit.on]
+    wrong += [f"+{name}" for name in told if name in fit.on and name not in true]
     has = [*true, *(["registered"] if made["registered"] else [])]
     cells = [folder.name, *(f"{error:+.1f} %" for error in (fit.gamma, fit.n, fit.q))]
     cells += ["-" if math.isnan(fit.guides_mm) else f"{fit.guides_mm:.2f} mm"]
