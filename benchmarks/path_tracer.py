@@ -153,7 +153,8 @@ class Studio:
         self.caster = Caster(self.surface)
         self.camera = camera_from_dict(drawn.lens.to_dict(), Path("camera.json"))
         self.poses = colons.fly_through(colon, drawn.frames, drawn.step_mm, drawn.start_mm)
-        mesh = _mesh(mi, vertices, self._triangles, normals, self._albedo, roughness, drawn)
+        coat = {"clearcoat": drawn.coat, "clearcoat_gloss": drawn.gloss} if drawn.coat else {}
+        mesh = colons.tissue_mesh(vertices, self._triangles, normals, self._albedo, roughness, **coat)
         guide = _guide(mi)
         self._guides = [mi.load_dict({"type": guide, "n": drawn.n}) for _ in drawn.guides_mm]
         # Of several lights a path takes one by chance: direct light is without noise from one at a time.
@@ -219,24 +220,6 @@ class Studio:
         forward = self.camera.pixel_directions[..., 2]
         hits = self.caster.cast(self.camera, T_world_camera)
         return np.nan_to_num(hits.laid_out(hits.distance_mm, forward.shape) * forward)
-
-
-def _mesh(mi, vertices, triangles, normals, albedo, roughness, drawn: Draw):
-    """The wall under Mitsuba's principled BSDF."""
-    bsdf = {"type": "principled", "specular": 0.5, "metallic": 0.0}
-    bsdf |= {key: {"type": "mesh_attribute", "name": f"vertex_{key}"} for key in ("base_color", "roughness")}
-    if drawn.coat:
-        bsdf |= {"clearcoat": drawn.coat, "clearcoat_gloss": drawn.gloss}
-    props = mi.Properties()
-    props["bsdf"] = mi.load_dict(bsdf)
-    mesh = mi.Mesh("colon", len(vertices), len(triangles), has_vertex_normals=True, props=props)
-    mesh.add_attribute("vertex_base_color", 3, np.float32(albedo).ravel())
-    mesh.add_attribute("vertex_roughness", 1, np.float32(roughness).ravel())
-    buffers = mi.traverse(mesh)
-    buffers["vertex_positions"], buffers["faces"] = np.float32(vertices).ravel(), np.uint32(triangles).ravel()
-    buffers["vertex_normals"] = np.float32(normals).ravel()
-    buffers.update()
-    return mesh
 
 
 def _guide(mi) -> str:

@@ -232,6 +232,29 @@ def fly_through(colon: Colon, frames: int, step_mm: float = 0.62, start_mm: floa
     return poses
 
 
+def tissue_mesh(vertices, triangles, normals, albedo, roughness, **more):
+    """Mitsuba's mesh of the wall under the principled BSDF, with ``more`` of its parameters."""
+    bsdf = {
+        "type": "principled",
+        "base_color": {"type": "mesh_attribute", "name": "vertex_albedo"},
+        "roughness": {"type": "mesh_attribute", "name": "vertex_roughness"},
+        "specular": 0.5,
+        "metallic": 0.0,
+        **more,
+    }
+    props = mi.Properties()
+    props["mesh_bsdf"] = mi.load_dict(bsdf)
+    mesh = mi.Mesh("colon", len(vertices), len(triangles), has_vertex_normals=True, props=props)
+    mesh.add_attribute("vertex_albedo", 3, np.float32(albedo).ravel())
+    mesh.add_attribute("vertex_roughness", 1, np.float32(roughness).ravel())
+    buffers = mi.traverse(mesh)
+    buffers["vertex_positions"] = np.float32(vertices).ravel()
+    buffers["vertex_normals"] = np.float32(normals).ravel()
+    buffers["faces"] = np.uint32(triangles).ravel()
+    buffers.update()
+    return mesh
+
+
 class Renderer:
     """Mitsuba's scene of the mesh and one point light of unit intensity, which goes with the camera."""
 
@@ -239,23 +262,7 @@ class Renderer:
         self.camera = camera
         self.triangles, self.vertices = triangles, vertices
         self.materials = np.column_stack([albedo.reshape(-1, 3), roughness.ravel()])
-        bsdf = {
-            "type": "principled",
-            "base_color": {"type": "mesh_attribute", "name": "vertex_albedo"},
-            "roughness": {"type": "mesh_attribute", "name": "vertex_roughness"},
-            "specular": 0.5,
-            "metallic": 0.0,
-        }
-        props = mi.Properties()
-        props["mesh_bsdf"] = mi.load_dict(bsdf)
-        mesh = mi.Mesh("colon", len(vertices), len(triangles), has_vertex_normals=True, props=props)
-        mesh.add_attribute("vertex_albedo", 3, np.float32(albedo).ravel())
-        mesh.add_attribute("vertex_roughness", 1, np.float32(roughness).ravel())
-        buffers = mi.traverse(mesh)
-        buffers["vertex_positions"] = np.float32(vertices).ravel()
-        buffers["vertex_normals"] = np.float32(normals).ravel()
-        buffers["faces"] = np.uint32(triangles).ravel()
-        buffers.update()
+        mesh = tissue_mesh(vertices, triangles, normals, albedo, roughness)
         self.scene = mi.load_dict(
             {"type": "scene", "colon": mesh, "light": {"type": "point", "intensity": 1.0}}
         )

@@ -104,6 +104,7 @@ class _Trial:
         self._decisions: dict[str, Decision] = {}
         self._seconds = dict.fromkeys((*TOGETHER, *BESIDE), 0.0)
         self._model, self._bouncing = cache(self._fitted), cache(self._bounced)
+        self._with, self._gain_is_plain = cache(self._fitted_with), cache(self._no_uneven_bounce)
         self._guides_mm = {False: AT_LENS, True: AT_LENS}
 
     def wanted(self, name: str) -> str:
@@ -212,7 +213,7 @@ class _Trial:
     def _tried(self, name: str, kept: Fitted | None) -> bool:
         return self.wanted(name) != "off" and self._tellable(name, kept)
 
-    def _with(self, name: str, kept: Fitted) -> Fitted:
+    def _fitted_with(self, name: str, kept: Fitted) -> Fitted:
         """``kept`` with profile or vignetting beside it."""
         other = self._mixed(kept) if name == "profile" else replace(kept.hypothesis, vignetting=True)
         return self._probe.fit(other)
@@ -318,7 +319,7 @@ class _Trial:
         model = self._model(names)
         found = worth(name, verdict, model)
         if name == "gain":
-            return found and self._no_uneven_bounce(names)
+            return found and self._gain_is_plain(names)
         if name == "offset":
             return (found and self._borne_out(model, verdict)) or self._ground.certain(model, verdict)
         return found

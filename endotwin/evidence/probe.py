@@ -83,7 +83,7 @@ class Hypothesis:
     uneven: bool = False
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Fitted:
     """A hypothesis with its coefficients, the design that they belong to, and where that is linearised.
 

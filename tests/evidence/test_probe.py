@@ -69,11 +69,8 @@ def test_a_gain_and_a_bounce_that_errs_from_frame_to_frame_are_told_apart(exampl
     """As strong as they pass for each other: each is the better model of what it made itself."""
     even = Hypothesis(bounced=Surroundings(example).bounced(Hypothesis()))
     rng, light = np.random.default_rng(2), log_light(example, even)
-    albedo, direct, bounced = (
-        rng.normal(0, 0.2, example.count),
-        light.irradiance(2, 2),
-        np.exp(light.bounced.log),
-    )
+    albedo = rng.normal(0, 0.2, example.count)
+    direct, bounced = light.irradiance(2, 2), np.exp(light.bounced.log)
     wander = np.sin(np.arange(len(example.frames)))[example.frame]
 
     def verdict(log_gain: float, log_bounce: float) -> Verdict:
