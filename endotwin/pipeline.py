@@ -9,13 +9,12 @@ from numbers import Integral, Real
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from endotwin.cameras import read_camera
 from endotwin.config import STANDARD, FitConfig, FuseConfig
 from endotwin.effects import checked_states
 from endotwin.errors import OptionError, SequenceError, TwinError
 from endotwin.fit import fit
 from endotwin.render.price import priced
-from endotwin.run.arguments import check_positive, check_whole, texts
+from endotwin.run.arguments import check_positive, check_whole
 from endotwin.run.stopwatch import Stopwatch
 from endotwin.sequence.readers import open_sequence
 from endotwin.twin import Source, Twin, as_twin
@@ -24,7 +23,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from endotwin.sequence import Sequence
-    from endotwin.synth import Job, Limits, Summary
+    from endotwin.synth import Limits, Summary
 
 GEOMETRIES = ("known", "heldout")
 
@@ -246,12 +245,13 @@ def synthesize(
         OptionError: an edit, label or layout is not understood. OutputError: ``out`` exists, or cannot be
         written.
     """
-    from endotwin.synth import Crew, render_dataset
+    from endotwin.synth import Crew, Order, render_dataset
 
     check_whole("number of workers", workers)
-    wanted = (motion, polyps, fluids, labels, layout, limits, seed)
+    varied = (material, light, vary, camera, effects)
+    order = Order(trajectory, *varied, motion, polyps, fluids, labels, layout, limits, seed)
     with Crew(1 if scheduler else workers) as crew:
-        job = _job(twin, trajectory, material, light, vary, camera, effects, *wanted, crew.expected)
+        job = order.job(twin, crew.expected)
         return render_dataset(job, out, workers, scheduler, overwrite, progress, crew.pool)
 
 
@@ -347,55 +347,11 @@ def preview(
     line.
     """
     from endotwin.look import preview as draw
+    from endotwin.synth import Order
 
-    wanted = (motion, polyps, fluids, "rgb", "c3vd", limits, seed)
-    job = _job(twin, trajectory, material, light, vary, camera, effects, *wanted)
-    return draw.preview(job, out, overwrite)
-
-
-def _job(
-    twin: Twin | Path | str,
-    trajectory: str | Path | np.ndarray,
-    material: Iterable[str] | str,
-    light: Iterable[str] | str,
-    vary: Path | str | None,
-    camera: Path | str | None,
-    effects: Mapping[str, str] | None,
-    motion: Iterable[str] | str,
-    polyps: Iterable[str] | str,
-    fluids: Iterable[str] | str,
-    labels: Iterable[str] | str | None,
-    layout: str,
-    limits: Limits | None,
-    seed: int,
-    expected: Callable[[int], None] = lambda pixels: None,
-) -> Job:
-    """The job of ``synthesize``'s arguments; ``expected`` is told the pixels of all frames once they are
-    known."""
-    from endotwin import synth
-
-    twin = as_twin(twin)
-    lens = read_camera(Path(camera)) if camera else twin.camera
-    twin = synth.equipped(twin, effects or {}, trajectory)
-    check_whole("seed", seed)
-    edits = [synth.parse_material_edit(edit) for edit in texts("material", material)]
-    variation = synth.fixed(edits, [synth.parse_light_edit(edit) for edit in texts("light", light)])
-    if vary:
-        variation = synth.read_variation(Path(vary), twin, variation)
-    grows, wet = bool(polyps or twin.polyps), bool(fluids or twin.fluids)
-    chosen = (*synth.DEFAULT_LABELS, *(("polyp",) if grows else ()), *(("fluid",) if wet else ()))
-    if labels is not None:
-        chosen = synth.parse_labels(",".join(texts("labels", labels)), bool(motion), grows, wet)
-    poses = synth.parse_trajectory(trajectory, twin, seed, lens, limits)
-    expected(len(poses) * lens.width * lens.height)
-    for added, specs in ((synth.with_polyps, polyps), (synth.with_fluids, fluids)):
-        if specs:
-            twin, weights = added(twin, specs, seed, poses, lens)
-            variation, poses = variation.carried(weights), synth.kept_in(poses, twin, lens)
-    moving = synth.parse_motion(motion, twin)
-    if moving:
-        poses = moving.carried(poses)
-    return synth.make_job(twin, poses, seed, chosen, layout, lens, variation, moving)
+    varied = (material, light, vary, camera, effects)
+    order = Order(trajectory, *varied, motion, polyps, fluids, "rgb", limits=limits, seed=seed)
+    return draw.preview(order.job(twin), out, overwrite)
 
 
 def _check_frames(left_out: Iterable[int], sequence: Sequence) -> None:

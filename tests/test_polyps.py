@@ -20,7 +20,7 @@ from endotwin.errors import OptionError, TrajectoryError, TwinError
 from endotwin.light.film import Film
 from endotwin.surface.casting import Caster
 from endotwin.surface.vectors import dot, unit
-from endotwin.synth import Trajectory, parse_labels, prove, with_polyps
+from endotwin.synth import Order, Trajectory, parse_labels, prove, with_polyps
 from endotwin.synth.job import Job, fingerprint
 from endotwin.synth.labels import Labeller
 from endotwin.synth.motion.crossing import crossings
@@ -364,10 +364,7 @@ def test_a_painted_region_stays_where_it_was_painted(bare, tmp_path):
     (tmp_path / "vary.yaml").write_text(
         "regions: [{name: half, vertices: half.npy, material: [base_color=0.1]}]\n"
     )
-    from endotwin import pipeline
-
-    wanted = ("Is:size=4", (), "rgb", "c3vd", None, 0)
-    job = pipeline._job(bare, poses(), (), (), tmp_path / "vary.yaml", None, None, (), *wanted)
+    job = Order(poses(), vary=tmp_path / "vary.yaml", polyps="Is:size=4", labels="rgb").job(bare)
     (region,) = job.regions
     assert len(region.weight) == len(job.twin.surface.vertices_mm) > len(half)
     sure = np.abs(job.twin.surface.vertices_mm[:, 1]) > 6

@@ -9,9 +9,9 @@ from endotwin.synth.polyps import with_polyps
 from endotwin.synth.proof import Proof, prove
 from endotwin.synth.run.crew import Crew
 from endotwin.synth.run.dataset import Summary, make_job, render_dataset, synthesize
+from endotwin.synth.run.order import Order
 from endotwin.synth.trajectories import Trajectory, parse_trajectory
 from endotwin.synth.trajectories.screening import Limits
-from endotwin.synth.trajectories.trajectory import kept_in
 from endotwin.synth.variation import Variation, fixed, read_variation
 from endotwin.synth.variation.edits import Edit, parse_light_edit, parse_material_edit
 from endotwin.synth.variation.switches import equipped
@@ -25,13 +25,13 @@ __all__ = [
     "Job",
     "Limits",
     "Motion",
+    "Order",
     "Proof",
     "Summary",
     "Trajectory",
     "Variation",
     "equipped",
     "fixed",
-    "kept_in",
     "make_job",
     "parse_labels",
     "parse_light_edit",
