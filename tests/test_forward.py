@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import test_model
 import torch
+from independent.gloss import Gloss
 
 from endotwin.effects.coat import Coat
 from endotwin.effects.tone import Tone
@@ -97,3 +98,14 @@ def test_the_derivatives_of_least_squares_are_those_of_automatic_differentiation
     torch.testing.assert_close(model.by_roughness, by_roughness.diagonal(dim1=0, dim2=2).T, **close)
     if coat is not None:
         torch.testing.assert_close(model.by_coat, by_weight, **close)
+
+
+@pytest.mark.parametrize("weight", [0.4, 1.0, 3.0, 50.0])
+def test_a_coat_mirrors_light_from_all_around_as_a_layer_of_its_reflectance_and_never_all_of_it(weight):
+    """One that covers half of the tissue mirrors half at any angle; one brighter than water is denser, and
+    mirrors all of what grazes it, not as many times all."""
+    cos, roughness = torch.linspace(0.02, 1, 50, dtype=torch.float64), 0.3
+    share = Lobes(0.0, coat=(weight, roughness, 2.0)).gloss(cos, torch.full_like(cos, 0.4)).numpy()
+    layer = Gloss(max(1.0, weight) * shading.F0_WATER).at(cos.numpy(), np.full(len(cos), roughness))
+    np.testing.assert_allclose(share, min(1.0, weight) * layer, atol=0.02)
+    assert share.max() <= 1

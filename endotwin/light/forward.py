@@ -76,14 +76,16 @@ class Lobes:
 
     def gloss(self, cos_o: Tensor, roughness: Tensor) -> Tensor:
         """Share of light from all around that the white lobes of points of ``roughness`` send to the camera,
-        [N]."""
+        [N]. A coat of weight below 1 lies on as much of the tissue; a heavier one is denser than water, and
+        mirrors, as any layer, all of what grazes it."""
         share = torch.zeros_like(cos_o * roughness)
         if self.f0 > 0:
             share = share + shading.specular_of_even_light(cos_o, roughness, self.f0)
         if self.coat is not None:
             weight, smooth, _ = self.coat
-            water = shading.specular_of_even_light(cos_o, torch.full_like(share, smooth), shading.F0_WATER)
-            share = share + weight * water
+            f0, covered = shading.F0_WATER * max(1.0, weight), min(1.0, weight)
+            coat = shading.specular_of_even_light(cos_o, torch.full_like(share, smooth), f0)
+            share = share + covered * coat
         return share
 
     def glossy_albedo(self, roughness: Tensor) -> Tensor:
