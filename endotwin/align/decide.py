@@ -30,14 +30,19 @@ PHOTOS, VERTICES = 72, 15_000
 
 GLANCE_PHOTOS, GLANCE_VERTICES = 12, 6_000
 
-JUDGES = 3
-"""Every third photo judges what the others choose."""
+JUDGES, FIRST = 3, 1
+"""Every third photo, from the second on, judges what the others choose; where these are not sure, the other
+two thirds do so in turn."""
 
 BLURS = (0.006, 0.003, 0.0015, 0.0015, 0.0015, 0.0015)
 """Widths of the blurs, coarse to fine, of the image's width."""
 
 LENS_BLURS = BLURS[3:]
 OWN_BLURS = (0.0015, 0.0015, 0.0015)
+
+SETTLED, MOST_STEPS = 0.25, 8
+"""Steps of all photos end with one that goes by less than half of a standard deviation in each correction, or
+after so many."""
 
 LEAST_BLUR_PX = 0.7
 
@@ -85,7 +90,7 @@ class Aligner:
     """One search for corrections.
 
     Attributes:
-        frames: int [F], the photos that take part; ``choosers`` and ``judges`` among them.
+        frames: int [F], the photos that take part. choosers: those of them that choose first.
     """
 
     def __init__(self, twin: Twin, caster: Caster, progress: Progress | None):
@@ -93,8 +98,7 @@ class Aligner:
         self.sequence: Sequence = twin.source.at_scale(scale).open()
         training = np.array(twin.source.training(len(self.sequence)))
         self.frames = training[spread(len(training), PHOTOS)]
-        judging = np.arange(len(self.frames)) % JUDGES == JUDGES // 2
-        self.choosers, self.judges = self.frames[~judging], self.frames[judging]
+        self.choosers, _ = self._sides(FIRST)
         self.caster, self.camera = caster.threaded(1), self.sequence.camera
         self.photos: dict = {}
         self._progress = progress or _silent
@@ -111,7 +115,7 @@ class Aligner:
         now, blur_px = Corrections.none(self.sequence.T_world_camera), self.blur_px(BLURS[1])
         photos = self._read(some)
         before = look(scene, photos, now.poses, some, blur_px)
-        after = step(now, before, some, lens=True, own=True)
+        after, _ = step(now, before, some, lens=True, own=True)
         return _cost_db(before, look(self._through(scene, after), photos, after.poses, some, blur_px))
 
     def run(self, forced: bool) -> tuple[Corrections | None, str, Verdict]:
@@ -124,6 +128,8 @@ class Aligner:
         shared = self._steps(scene, none, self.choosers, BLURS)
         now = self._errors(scene, shared)
         gained = now.better_than(was)
+        if not forced and gained.gain_db >= MIN_GAIN_DB and gained.sigmas < MIN_SIGMAS:
+            gained = self._judged_by_all(scene, none, was, now)
         if not forced and not _keeps(gained):
             return None, f"what the photos ask for does not help others ({gained})", gained
         lensed = self._steps(scene, shared, self.choosers, LENS_BLURS, lens=True)
@@ -134,11 +140,34 @@ class Aligner:
         own = self._steps(scene, shared, self.choosers, OWN_BLURS, lens, own=True)
         more = self._errors(scene, own)
         if _keeps(more.better_than(now)):
-            best = self._steps(scene, own, self.frames, OWN_BLURS[:1], lens, own=True)
             verdict = more.better_than(was)
-            return best, f"shared and drift: {verdict}", verdict
-        gained = now.better_than(was)
-        return self._steps(scene, shared, self.frames, OWN_BLURS[:1], lens), f"shared: {gained}", gained
+            return self._settled(scene, own, lens, own=True), f"shared and drift: {verdict}", verdict
+        if lens:
+            gained = now.better_than(was)
+        return self._settled(scene, shared, lens, own=False), f"shared: {gained}", gained
+
+    def _sides(self, first: int) -> tuple[np.ndarray, np.ndarray]:
+        """The frames that choose, and those that judge, every third from the ``first`` on."""
+        judging = np.arange(len(self.frames)) % JUDGES == first
+        return self.frames[~judging], self.frames[judging]
+
+    def _judged_by_all(self, scene: Scene, none: Corrections, was: Errors, now: Errors) -> Verdict:
+        """What all photos say of corrections that the others chose, where the first third says that these
+        bring its errors from what they ``was`` to ``now``."""
+        for first in {*range(JUDGES)} - {FIRST}:
+            chosen = self._steps(scene, none, self._sides(first)[0], BLURS)
+            was = was.and_of(self._errors(scene, none, first))
+            now = now.and_of(self._errors(scene, chosen, first))
+        return now.better_than(was)
+
+    def _settled(self, scene: Scene, start: Corrections, lens: bool, own: bool) -> Corrections:
+        """The corrections that all photos choose, from near them."""
+        now = start
+        for _ in range(MOST_STEPS):
+            now, went = self._step(scene, now, self.frames, BLURS[-1], lens, own)
+            if went < SETTLED:
+                break
+        return now
 
     def _through(self, scene: Scene, now: Corrections) -> Scene:
         """The scene before the camera that the corrections make of the written one."""
@@ -155,16 +184,21 @@ class Aligner:
     ) -> Corrections:
         now = start
         for share in blurs:
-            told = look(self._through(scene, now), self.photos, now.poses, frames, self.blur_px(share))
-            now = step(now, told, frames, lens, own)
-            self._looks += 1
-            self._progress("align", min(self._looks, self._expected), self._expected)
+            now, _ = self._step(scene, now, frames, share, lens, own)
         return now
 
-    def _errors(self, scene: Scene, now: Corrections) -> Errors:
-        blur_px = self.blur_px(BLURS[-1])
-        scene = self._through(scene, now)
-        return errors(scene, self.photos, now.poses, self.choosers, self.judges, blur_px)
+    def _step(
+        self, scene: Scene, now: Corrections, frames: np.ndarray, share: float, lens: bool, own: bool
+    ) -> tuple[Corrections, float]:
+        told = look(self._through(scene, now), self.photos, now.poses, frames, self.blur_px(share))
+        self._looks += 1
+        self._progress("align", min(self._looks, self._expected), self._expected)
+        return step(now, told, frames, lens, own)
+
+    def _errors(self, scene: Scene, now: Corrections, first: int = FIRST) -> Errors:
+        """Of every third photo from the ``first`` on, against what the others paint."""
+        scene, blur_px = self._through(scene, now), self.blur_px(BLURS[-1])
+        return errors(scene, self.photos, now.poses, *self._sides(first), blur_px)
 
     def _read(self, frames: np.ndarray) -> dict:
         missing = [frame for frame in frames.tolist() if frame not in self.photos]

@@ -43,6 +43,10 @@ class Errors:
     texture: list
     rims: list
 
+    def and_of(self, others: Errors) -> Errors:
+        """Of these photos and the ``others``."""
+        return Errors(self.texture + others.texture, self.rims + others.rims)
+
     def better_than(self, other: Errors) -> Verdict:
         """How much lower these are than ``other``'s."""
         total = np.zeros((len(self.texture), 2))

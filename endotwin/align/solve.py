@@ -89,9 +89,12 @@ def even(seen: Rim) -> tuple[np.ndarray, np.ndarray, float]:
     return left, weight, width
 
 
-def step(now: Corrections, told: Looked, frames: np.ndarray, lens: bool, own: bool) -> Corrections:
-    """The corrections after a Gauss–Newton step; intrinsics move if ``lens`` says so, and what the photos of
-    ``frames`` [F] have of their own if ``own`` does."""
+def step(
+    now: Corrections, told: Looked, frames: np.ndarray, lens: bool, own: bool
+) -> tuple[Corrections, float]:
+    """The corrections after a Gauss–Newton step, and how far that went: the mean over what moved of squares
+    of standard deviations by which all photos tell it. Intrinsics move if ``lens`` says so, and what the
+    photos of ``frames`` [F] have of their own if ``own`` does."""
     count, shared = len(frames), SHARED if lens else PLACED
     flat = told.matrix.reshape(OF_PHOTO * count, OF_PHOTO * count)
     to_photos = now.slopes()[frames][..., :shared].reshape(OF_PHOTO * count, shared)
@@ -105,4 +108,5 @@ def step(now: Corrections, told: Looked, frames: np.ndarray, lens: bool, own: bo
     right = to_photos.T @ told.right.reshape(-1) - precision @ before
     found = scipy.linalg.cho_solve(scipy.linalg.cho_factor(normal), right)
     moved = found[shared:].reshape(count, 6) if own else np.zeros((count, 6))
-    return now.stepped(np.r_[found[:shared], np.zeros(SHARED - shared)], moved, frames)
+    stepped = now.stepped(np.r_[found[:shared], np.zeros(SHARED - shared)], moved, frames)
+    return stepped, float(right @ found) / len(found)
