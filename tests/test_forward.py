@@ -105,7 +105,7 @@ def test_a_coat_mirrors_light_from_all_around_as_a_layer_of_its_reflectance_and_
     """One that covers half of the tissue mirrors half at any angle; one brighter than water is denser, and
     mirrors all of what grazes it, not as many times all."""
     cos, roughness = torch.linspace(0.02, 1, 50, dtype=torch.float64), 0.3
-    share = Lobes(0.0, coat=(weight, roughness, 2.0)).gloss(cos, torch.full_like(cos, 0.4)).numpy()
+    share = Lobes(0.0, coat=(weight, roughness, 2.0)).gloss(cos, torch.full_like(cos, 0.4))[:, 0].numpy()
     layer = Gloss(max(1.0, weight) * shading.F0_WATER).at(cos.numpy(), np.full(len(cos), roughness))
     np.testing.assert_allclose(share, min(1.0, weight) * layer, atol=0.02)
     assert share.max() <= 1

@@ -153,7 +153,7 @@ def test_bright_tissue_and_the_light_that_it_throws_settle_where_they_agree(alik
             light, by_scale = thrower / (1 - thrower), torch.from_numpy(1 / (1 - thrower))[None]
             shown = torch.log(torch.from_numpy(found))[None]
             bounce = Bounce(
-                *[torch.zeros(1, 3)] * 3, by_scale, torch.zeros(1, 3), torch.zeros(1), shown=shown
+                *[torch.zeros(1, 3)] * 3, by_scale, torch.zeros(1, 3), torch.zeros(1, 2), shown=shown
             )
 
             def lacking(log_color, light=light, bounce=bounce):

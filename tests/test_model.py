@@ -135,7 +135,7 @@ def in_a_tube(samples: Samples) -> Samples:
         by_q=uniform(-4, -2),
         by_scale=uniform(1, 2, 3),
         by_gamma=uniform(1, 4, 3),
-        gloss=uniform(0, 0.1),
+        gloss=torch.stack([uniform(0, 0.1), uniform(0.8, 1)], dim=1),
     )
     return replace(samples, bounce=bounce)
 

@@ -14,7 +14,9 @@ class Coat(Effect):
 
     D is generalised Trowbridge–Reitz: GGX for a ``tail`` of 2, Burley's own coat, with a far haze, for 1.
 
-    It adds to the other lobes; what it takes from them (at most 4 %) is left to the fitted base colour.
+    Of the guides' light it adds to the other lobes; what it takes from them (4 % where it is not grazed) is
+    left to the fitted base colour. Of what other tissue throws it mirrors more the more it is grazed, and
+    lets through the rest: water's share times a weight up to 1, Schlick's of weight·F beyond.
     """
 
     name: ClassVar[str] = "coat"

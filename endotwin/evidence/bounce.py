@@ -45,7 +45,7 @@ class Surroundings:
         self._linear = (np.maximum(samples.color.numpy(), 1) / 255.0) ** (1 / PRIOR["gamma"])
         lobes = Lobes(F0_DIELECTRIC)
         self._glossy = np.full((radiosity.count, 1), lobes.glossy_albedo(roughness))
-        self._gloss = lobes.gloss(samples.cos, roughness).numpy()
+        self._gloss = lobes.gloss(samples.cos, roughness)[:, 0].numpy()
 
     def bounced(self, hypothesis: Hypothesis) -> Bounced:
         """Indirect light at the pixels, with n, q and γ at their priors.

@@ -235,7 +235,7 @@ class Bouncer:
             return Albedo.of(self._radiosity, base_color, materials[:, 3], lobes, triangles.numpy())
 
         places, base_color = self._places(samples), materials[:, :3]
-        gloss = lobes.gloss(samples.cos, roughness) * math.exp(-scale)
+        gloss = lobes.gloss(samples.cos, roughness) * torch.tensor([math.exp(-scale), 1.0])
         by, seen_by = ("scale",), None
         if not self.light_stays:
             steeper = base_color ** (shared.gamma / (shared.gamma + GAMMA_STEP))

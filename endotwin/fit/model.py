@@ -269,7 +269,7 @@ def linearise(samples: Samples, material: Tensor, shared: Globals) -> Linearised
     coat = None if lobes.coat is None else sum(share.coat for share in shares).detach()[:, None]
     if samples.bounce is not None:
         bounced, mirrored = forward.bounced(lit, log_light)
-        glow = bounced * base_color + mirrored * lit.gloss[:, None]
+        glow = bounced * base_color + mirrored * lit.gloss[:, :1]
         x, per_color = x + glow, per_color + bounced
         axis = axis + glow * samples.bounce.by_n[:, None]
         distance = distance - glow * samples.bounce.by_q[:, None]

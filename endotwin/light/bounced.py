@@ -101,8 +101,7 @@ class Bounce(Rows):
 
     Attributes:
         log, by_scale, by_gamma: float32 [N, 3]. by_n, by_q: float32 [N], the channels' mean.
-        gloss: float32 [N], share of what the points mirror that their white lobes send to the camera; None:
-            nobody asked for it.
+        gloss: float32 [N, 2], ``Lobes.gloss`` of the points; None: nobody asked for it.
         surroundings: float32 [N, 3], radiosity of that over E; None: 1.
         shown: float32 [N, 3], γ·ln of the points' base colours that throw it; None: it follows no colours.
         tissue: float32 [N, 3], γ times the mean of ln of all tissue's, alike in all rows.
@@ -220,7 +219,7 @@ class BouncedLight:
     ) -> Bounce:
         """The bounce as a function of n, q, the albedo's scale and γ, exact where they are as given here.
 
-        ``gloss`` [N] is the bounce's; None: what points mirror is not asked for. ``seen_by``: γ, and the
+        ``gloss`` [N, 2] is the bounce's; None: what points mirror is not asked for. ``seen_by``: γ, and the
         albedo that photos tell of with γ + GAMMA_STEP; None: whatever γ, the albedo is the same. ``by``:
         those of BOUNCES_BY that are to change; each of them takes its time.
         """

@@ -1,11 +1,11 @@
 """The radiance of a surface point: the one place where it is written, for the renderer and for the fit.
 
-x = Σ_k g_k·(D_k·b/π + f0·S_k + w·f0_water·S'_k) + 2·L0·(E·b + B·ρ), with g = 2π·L·(n·ωi) of each guide, D the
-diffuse factor, S the specular lobe of the tissue and S' that of a coat of weight w, E what other tissue
-throws on the point for L0 = 1, B the radiosity of what the point mirrors to the camera, and ρ the white
-lobes' share of that. Han & Wu 2025 with one guide at the lens, no coat and no E; Burley's diffuse lobe unless
-D is 1. It is linear in the base colour b, and in what each guide gives exponential in n and q: the
-derivatives by those follow from the same pieces.
+x = Σ_k g_k·(D_k·b/π + f0·S_k + w·f0_water·S'_k) + 2·L0·(E·τ·b + B·ρ), with g = 2π·L·(n·ωi) of each guide, D
+the diffuse factor, S the specular lobe of the tissue and S' that of a coat of weight w, E what other tissue
+throws on the point for L0 = 1, τ the share that the coat lets through, B the radiosity of what the point
+mirrors to the camera, and ρ the white lobes' share of that. Han & Wu 2025 with one guide at the lens, no coat
+and no E; Burley's diffuse lobe unless D is 1. It is linear in the base colour b, and in what each guide gives
+exponential in n and q: the derivatives by those follow from the same pieces.
 """
 
 from __future__ import annotations
@@ -33,7 +33,8 @@ class Lit:
         log_exposure: [N], ln of what camera and lens make of all light; None: 0.
         irradiance: [N, 3], what other tissue throws on them for L0 = 1; None: nothing.
         mirrored: [N, 3], radiosity of the tissue that they mirror to the camera, for L0 = 1.
-        gloss: [N], share of light from there that the white lobes send on.
+        gloss: [N, 2], share of light from there that the white lobes send on; and of what the base color
+            sends, that the coat lets through.
     """
 
     cos_o: Tensor
@@ -75,24 +76,27 @@ class Lobes:
         return replace(self, f0=factor * self.f0, coat=coat)
 
     def gloss(self, cos_o: Tensor, roughness: Tensor) -> Tensor:
-        """Share of light from all around that the white lobes of points of ``roughness`` send to the camera,
-        [N]. A coat of weight below 1 lies on as much of the tissue; a heavier one is denser than water, and
-        mirrors, as any layer, all of what grazes it."""
-        share = torch.zeros_like(cos_o * roughness)
+        """Of light from all around, [N, 2]: the share that the white lobes of points of ``roughness`` send to
+        the camera, and that which a coat lets through of what the tissue beneath it sends there.
+
+        A coat of weight below 1 lies on as much of the tissue; a heavier one is denser than water. As any
+        layer it mirrors all of what grazes it, which the tissue then does not.
+        """
+        tissue = coat = torch.zeros_like(cos_o * roughness)
         if self.f0 > 0:
-            share = share + shading.specular_of_even_light(cos_o, roughness, self.f0)
+            tissue = shading.specular_of_even_light(cos_o, roughness, self.f0)
         if self.coat is not None:
             weight, smooth, _ = self.coat
             f0, covered = shading.F0_WATER * max(1.0, weight), min(1.0, weight)
-            coat = shading.specular_of_even_light(cos_o, torch.full_like(share, smooth), f0)
-            share = share + covered * coat
-        return share
+            coat = covered * shading.specular_of_even_light(cos_o, torch.full_like(coat, smooth), f0)
+        through = 1 - coat
+        return torch.stack([coat + through * tissue, through], dim=-1)
 
     def glossy_albedo(self, roughness: Tensor) -> Tensor:
-        """Share of light from all around that they send back in all, [N]: 2·∫gloss(cos)·cos d cos."""
+        """Share of light from all around that white lobes send back in all, [N]: 2·∫gloss(cos)·cos d cos."""
         nodes, weights = np.polynomial.legendre.leggauss(8)
         cos, weights = (torch.from_numpy(x).to(roughness.dtype) for x in ((nodes + 1) / 2, weights))
-        return (self.gloss(cos, roughness[..., None]) * cos * weights).sum(dim=-1)
+        return (self.gloss(cos, roughness[..., None])[..., 0] * cos * weights).sum(dim=-1)
 
 
 @dataclass(frozen=True)
@@ -150,7 +154,7 @@ def bounced(lit: Lit, log_light: LogLight) -> tuple[Tensor, Tensor]:
     if lit.log_exposure is not None:
         log_factor = (log_factor + lit.log_exposure)[:, None]
     factor = 2 * torch.exp(log_factor)
-    return lit.irradiance * factor, lit.mirrored * factor
+    return lit.irradiance * factor * lit.gloss[:, 1:], lit.mirrored * factor
 
 
 def radiance(lit: Lit, log_light: LogLight, base_color: Tensor, roughness: Tensor, lobes: Lobes) -> Tensor:
@@ -166,4 +170,4 @@ def radiance(lit: Lit, log_light: LogLight, base_color: Tensor, roughness: Tenso
 def glow(lit: Lit, log_light: LogLight, base_color: Tensor) -> Tensor:
     """The share of ``radiance`` that other tissue throws on the points, [N, 3]."""
     per_color, mirrored = bounced(lit, log_light)
-    return per_color * base_color + mirrored * lit.gloss[:, None]
+    return per_color * base_color + mirrored * lit.gloss[:, :1]

@@ -98,8 +98,8 @@ class Studio:
         x = 2 * albedo * diffuse[:, None] + 2 * np.pi * shine[:, None]
         if "interreflection" in scene.effects:
             arriving, mirrored = self._bounce.at(view.frame, view.place)
-            share = self._glossy(scene, dot(view.normals, to_eye), roughness)
-            x += 2 * scene.L0 * (albedo * arriving + share[:, None] * mirrored)
+            share, through = self._glossy(scene, dot(view.normals, to_eye), roughness)
+            x += 2 * scene.L0 * (through[:, None] * albedo * arriving + share[:, None] * mirrored)
         if "vignetting" in scene.effects:
             x *= np.exp(-scene.vignetting * view.squared_radius)[:, None]
         return x * scene.gains[view.frame]
@@ -130,12 +130,14 @@ class Studio:
             return np.ones(len(hits.rays), bool)
         return self.wall.sees(pose[:3, 3] + pose[:3, :3] @ np.asarray(guide_mm), hits.points_mm)
 
-    def _glossy(self, scene: Scene, cos: np.ndarray, roughness: np.ndarray) -> np.ndarray:
-        """Share of light from about the mirror's direction that lobes send to the eye, [N]."""
-        share = self._gloss.at(cos, roughness)
+    def _glossy(self, scene: Scene, cos: np.ndarray, roughness: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Share of light from about the mirror's direction that lobes send to the eye, [N], and share of what
+        tissue sends there that passes the coat, where it does not mirror."""
+        share, through = self._gloss.at(cos, roughness), np.ones_like(cos)
         if "coat" in scene.effects:
-            share = share + scene.coat_weight * self._film.at(cos, np.full_like(cos, scene.coat_roughness))
-        return share
+            film = scene.coat_weight * self._film.at(cos, np.full_like(cos, scene.coat_roughness))
+            share, through = film + (1 - film) * share, 1 - film
+        return share, through
 
     def _transported(self, rng: np.random.Generator) -> Bounce:
         """The light between tissue and tissue in every frame, for L0 = 1."""
