@@ -57,17 +57,20 @@ def test_even_surroundings_shine_as_the_lobes_integral_says(f0) -> None:
     np.testing.assert_allclose(found, Gloss(f0).at(cos, roughness), atol=0.005)
 
 
-def test_a_coat_reflects_even_surroundings_as_a_film_of_water_does() -> None:
+def test_a_coat_reflects_even_surroundings_as_a_film_of_water_does_and_hides_as_much_beneath_it() -> None:
     cos, roughness = np.linspace(0.2, 1, 9), np.full(9, 0.4)
-    bare, wet = (Lobes(0.04, coat=coat) for coat in (None, (0.7, 0.3, 2.0)))
-    arguments = torch.from_numpy(cos), torch.from_numpy(roughness)
-    more = (wet.gloss(*arguments) - bare.gloss(*arguments)).numpy()
-    np.testing.assert_allclose(more, 0.7 * Gloss(0.02).at(cos, np.full(9, 0.3)), atol=0.003)
-    assert not Lobes(0.0).gloss(*arguments).any()
+    wet = Lobes(0.04, coat=(0.7, 0.3, 2.0)).gloss(torch.from_numpy(cos), torch.from_numpy(roughness)).numpy()
+    film, tissue = 0.7 * Gloss(0.02).at(cos, np.full(9, 0.3)), Gloss(0.04).at(cos, roughness)
+    np.testing.assert_allclose(wet, np.c_[film + (1 - film) * tissue, 1 - film], atol=0.005)
+    bare = Lobes(0.0).gloss(torch.from_numpy(cos), torch.from_numpy(roughness)).numpy()
+    np.testing.assert_array_equal(bare, np.tile([0.0, 1.0], (9, 1)))
 
 
 def test_all_that_white_lobes_send_back_is_the_mean_over_directions() -> None:
     roughness, lobes = np.array([0.3, 0.5, 0.7]), Lobes(0.04, coat=(0.5, 0.3, 2.0))
-    expected = Gloss(0.04).mean(roughness) + 0.5 * Gloss(0.02).mean(np.full(3, 0.3))
+    expected = np.zeros(3)
+    for cos in (np.arange(16) + 0.5) / 16:
+        film = 0.5 * Gloss(0.02).at(np.full(3, cos), np.full(3, 0.3))
+        expected += (film + (1 - film) * Gloss(0.04).at(np.full(3, cos), roughness)) * cos / 8
     found = lobes.glossy_albedo(torch.from_numpy(roughness)).numpy()
     np.testing.assert_allclose(found, expected, rtol=0.02)
