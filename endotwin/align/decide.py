@@ -102,7 +102,7 @@ class Aligner:
         self.caster, self.camera = caster.threaded(1), self.sequence.camera
         self.photos: dict = {}
         self._progress = progress or _silent
-        self._looks, self._expected = 0, len(BLURS + LENS_BLURS + OWN_BLURS) + 1
+        self._looks, self._expected = 0, len(BLURS + LENS_BLURS + OWN_BLURS) + MOST_STEPS
 
     def blur_px(self, share: float) -> float:
         return max(LEAST_BLUR_PX, share * self.camera.width)
@@ -128,10 +128,11 @@ class Aligner:
         shared = self._steps(scene, none, self.choosers, BLURS)
         now = self._errors(scene, shared)
         gained = now.better_than(was)
-        if not forced and gained.gain_db >= MIN_GAIN_DB and gained.sigmas < MIN_SIGMAS:
-            gained = self._judged_by_all(scene, none, was, now)
         if not forced and not _keeps(gained):
-            return None, f"what the photos ask for does not help others ({gained})", gained
+            if gained.gain_db >= MIN_GAIN_DB:
+                gained = self._judged_by_all(scene, none, was, now)
+            if not _keeps(gained):
+                return None, f"what the photos ask for does not help others ({gained})", gained
         lensed = self._steps(scene, shared, self.choosers, LENS_BLURS, lens=True)
         seen = self._errors(scene, lensed)
         lens = _keeps(seen.better_than(now), LENS_GAIN_DB, LENS_SIGMAS)
@@ -154,6 +155,7 @@ class Aligner:
     def _judged_by_all(self, scene: Scene, none: Corrections, was: Errors, now: Errors) -> Verdict:
         """What all photos say of corrections that the others chose, where the first third says that these
         bring its errors from what they ``was`` to ``now``."""
+        self._expected += (JUDGES - 1) * len(BLURS)
         for first in {*range(JUDGES)} - {FIRST}:
             chosen = self._steps(scene, none, self._sides(first)[0], BLURS)
             was = was.and_of(self._errors(scene, none, first))
@@ -192,7 +194,7 @@ class Aligner:
     ) -> tuple[Corrections, float]:
         told = look(self._through(scene, now), self.photos, now.poses, frames, self.blur_px(share))
         self._looks += 1
-        self._progress("align", min(self._looks, self._expected), self._expected)
+        self._progress("align", self._looks, self._expected)
         return step(now, told, frames, lens, own)
 
     def _errors(self, scene: Scene, now: Corrections, first: int = FIRST) -> Errors:

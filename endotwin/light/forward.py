@@ -33,7 +33,7 @@ class Lit:
         log_exposure: [N], ln of what camera and lens make of all light; None: 0.
         irradiance: [N, 3], what other tissue throws on them for L0 = 1; None: nothing.
         mirrored: [N, 3], radiosity of the tissue that they mirror to the camera, for L0 = 1.
-        gloss: [N, 2], share of light from there that the white lobes send on; and of what the base color
+        gloss: [N, 2], share of light from there that the white lobes send on; and of what the base colour
             sends, that the coat lets through.
     """
 
