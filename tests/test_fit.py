@@ -15,6 +15,7 @@ import tube_sequence
 
 import endotwin
 from endotwin.config import FitConfig
+from endotwin.effects.processor import Processor
 from endotwin.effects.tone import Tone
 from endotwin.evaluation.evaluation import covered_pixels
 from endotwin.fit import fit
@@ -125,6 +126,7 @@ def test_materials_are_physical_and_the_brightest_albedo_has_the_agreed_scale(fi
 def test_the_record_tells_the_method_and_the_seconds_of_each_stage(fitted):
     record = fitted.record["fit"]
     assert record["method"] == "twin" and record["undetermined"] == []
+    assert record["sharpening_undone"] is None
     assert set(record["stages"]) >= {"gather", "start", "light", "detail"}
     assert sum(record["stages"].values()) == pytest.approx(record["seconds"], rel=0.1, abs=0.1)
 
@@ -161,6 +163,17 @@ def test_samples_carry_the_color_that_their_surface_point_has_under_their_incide
     error = np.abs(samples.color.numpy() / 255 - np.clip(radiance, 0, 1) ** tube_sequence.GAMMA)
     assert np.median(error) < 1 / 255
     assert np.percentile(error, 95) < 4 / 255
+
+
+def test_sharpened_photos_are_fitted_as_they_were_before(tube, monkeypatch):
+    processor = Processor(0.0, 1.5, 1.2)
+    monkeypatch.setattr(Processor, "evidence", lambda sequence: (processor, "told by the lens circle"))
+    samples, sequence = gather(tube, Pace(FitConfig(pixels=10**9)), 0, Caster(tube.surface)), tube.sequence()
+    for frame in samples.views.frames.tolist():
+        here, photo = samples.frame.numpy() == frame, sequence.color(frame)
+        before = processor.unsharpened(photo)
+        assert (before != photo).any()
+        assert (samples.color.numpy()[here] == before.reshape(-1, 3)[samples.pixel.numpy()[here]]).all()
 
 
 def test_pixels_through_which_the_edge_of_a_shadow_may_run_are_no_samples(tube):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -14,6 +15,9 @@ from endotwin.effects.effect import Effect, parameter
 from endotwin.effects.luma import LUMA
 from endotwin.effects.tone import Tone
 from endotwin.sequence import Sequence
+
+CLOSE = 0.01
+"""Share of what sharpening did to a pixel that is left when it is undone: less than a level."""
 
 
 @dataclass(frozen=True)
@@ -37,6 +41,23 @@ class Processor(Effect):
         luma = toned @ LUMA
         detail = luma - cv2.GaussianBlur(luma, (0, 0), self.radius, borderType=cv2.BORDER_REFLECT)
         return np.clip(toned + np.float32(self.sharpening) * detail[..., None], 0, 1)
+
+    def unsharpened(self, color: np.ndarray) -> np.ndarray:
+        """A photo uint8 [H, W, 3] as it was before its luminance was sharpened, the curve left on; black and
+        white stay, since what is clipped does not tell from where.
+
+        Luminance Y is the fixed point of Y = (Y'' + sharpening·G ∗ Y) / (1 + sharpening), and of what it is
+        off a pass leaves sharpening / (1 + sharpening).
+        """
+        share = self.sharpening / (1 + self.sharpening)
+        sharp = color @ LUMA
+        luma = sharp
+        for _ in range(math.ceil(math.log(CLOSE) / math.log(max(share, CLOSE)))):
+            soft = cv2.GaussianBlur(luma, (0, 0), self.radius, borderType=cv2.BORDER_REFLECT)
+            luma = (1 - share) * sharp + share * soft
+        restored = np.clip(color + (luma - sharp)[..., None] + 0.5, 0, 255).astype(np.uint8)
+        brightest = color.max(axis=2, keepdims=True)
+        return np.where((brightest > 0) & (brightest < 255), restored, color)
 
     @classmethod
     def evidence(cls, sequence: Sequence) -> tuple[Processor | None, str]:

@@ -45,7 +45,7 @@ class Model:
     def photo(self, views: Views, row: int) -> Based:
         """All pixels of the photo of ``row`` among the ``views``, with what the model shows there."""
         twin, effects = self.twin, self.relighting.effects
-        frame = twin.sequence().frame(int(views.frames[row]))
+        frame = views.frame(twin.sequence(), int(views.frames[row]))
         part = frame_samples(twin, self.caster, frame, views.lens_mask, 1.0, np.random.default_rng(0))
         return self.based(lit(Samples.joined([part], views), twin.surface, self.caster, effects))
 

@@ -111,7 +111,7 @@ def _about(judges: Based, report: Report) -> Samples:
     points_mm = twin.surface.vertices_mm[judges.vertices()]
 
     def one(row: int) -> Samples:
-        frame, pose = sequence.frame(int(views.frames[row])), views.T_local_camera[row]
+        frame, pose = views.frame(sequence, int(views.frames[row])), views.T_local_camera[row]
         near = _splatted(views.camera, (points_mm - pose[:3, 3]) @ pose[:3, :3])
         share = MOST / len(views.frames) / max(1, int(near.sum()))
         return frame_samples(

@@ -123,8 +123,15 @@ def fit_twin(
             effects = effects.including(effect)
         fitted = _fitted(twin, wet.model.state, effects, decisions, wet.film)
         priced = price(fitted, fit.caster, samples.views)
+    sharpened = samples.views.processor
     return priced.with_record(
-        fit={"method": "twin", "undetermined": list(lighted.start.undetermined), **stopwatch.to_dict()}
+        fit={
+            "method": "twin",
+            "undetermined": list(lighted.start.undetermined),
+            "sharpening_undone": sharpened
+            and {"amount": sharpened.sharpening, "radius_px": sharpened.radius},
+            **stopwatch.to_dict(),
+        }
     )
 
 

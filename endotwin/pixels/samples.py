@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from endotwin.cameras.base import Camera
+from endotwin.effects.processor import Processor
 from endotwin.effects.tone import Tone
 from endotwin.light.bounced import Bounce
 from endotwin.light.forward import Lit
@@ -21,7 +22,7 @@ from endotwin.pixels.length_unit import unit_mm
 from endotwin.pixels.pace import Pace
 from endotwin.run.ahead import ahead
 from endotwin.run.threads import THREADS
-from endotwin.sequence import Frame
+from endotwin.sequence import Frame, Sequence, Split
 from endotwin.surface import Surface
 from endotwin.surface.casting import Caster, Correspondences
 from endotwin.surface.rows import chosen
@@ -49,12 +50,21 @@ class Views:
         camera: that took them. lens_mask: bool [H, W], pixels within the lens circle.
         frames: int [F], their numbers in the sequence, ascending.
         T_local_camera: float64 [F, 4, 4], their poses in the surface's frame.
+        processor: what sharpened them; None: nothing that is told.
     """
 
     camera: Camera
     lens_mask: np.ndarray
     frames: np.ndarray
     T_local_camera: np.ndarray
+    processor: Processor | None = None
+
+    def frame(self, sequence: Sequence, index: int) -> Frame:
+        """Frame ``index`` with its photo as it was before it was sharpened."""
+        frame = sequence.frame(index)
+        if self.processor is None:
+            return frame
+        return replace(frame, color=self.processor.unsharpened(frame.color))
 
     def row(self, frame: Tensor) -> np.ndarray:
         """Where frames [N] stand among ``frames``, int [N]."""
@@ -213,15 +223,21 @@ def gather(twin: Twin, pace: Pace, seed: int, caster: Caster) -> Samples:
 
     A pixel counts if it lies within the lens circle, has a depth, lies off depth discontinuities, and its
     ray meets the surface at that depth, unless the photos were aligned apart from their depth maps. A photo
-    that is all black or clipped is left out with a warning, unless all are.
+    that is all black or clipped is left out with a warning, unless all are. Photos that a processor sharpened
+    are taken as they were before.
     """
     sequence = twin.sequence()
     frames = twin.source.training(len(sequence))
     share = pace.share(len(frames), int(sequence.lens_mask.sum()))
+    T_local_camera = twin.surface.to_local(sequence.T_world_camera[list(frames)])
+    processor, _ = Processor.evidence(replace(sequence, split=Split(tuple(frames), ())))
+    views = Views(twin.camera, sequence.lens_mask, np.array(frames), T_local_camera, processor)
 
     def one(index: int) -> tuple[int, Samples]:
         generator = np.random.default_rng((seed, index))
-        return index, frame_samples(twin, caster, sequence.frame(index), sequence.lens_mask, share, generator)
+        return index, frame_samples(
+            twin, caster, views.frame(sequence, index), views.lens_mask, share, generator
+        )
 
     read, parts = [], []
     for done, (index, part) in enumerate(ahead(one, pace.photos(frames), THREADS), 1):
@@ -234,9 +250,8 @@ def gather(twin: Twin, pace: Pace, seed: int, caster: Caster) -> Samples:
             logger.warning("%s is black or clipped and is not fitted", sequence.color_files[index])
     parts = [part for part, tells in zip(parts, shows, strict=True) if tells or not any(shows)]
     joined = Samples.joined(parts)
-    shown = np.unique(joined.frame.numpy())
-    T_local_camera = twin.surface.to_local(sequence.T_world_camera[shown])
-    views = Views(twin.camera, sequence.lens_mask, shown, T_local_camera)
+    shown = np.isin(views.frames, joined.frame.numpy())
+    views = replace(views, frames=views.frames[shown], T_local_camera=T_local_camera[shown])
     return replace(joined[torch.argsort(joined.triangle, stable=True)], views=views)
 
 

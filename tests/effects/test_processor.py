@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from photos import levels, textured
 from scipy.special import erf
 
 from endotwin.effects.luma import LUMA
@@ -45,3 +46,25 @@ def test_even_areas_and_colour_differences_stay():
             found[..., one] - found[..., other], image[..., one] - image[..., other], atol=1e-5
         )
     assert np.std(found @ LUMA) > 1.2 * np.std(image @ LUMA)
+
+
+@pytest.mark.parametrize(("amount", "radius"), [(0.6, 1.2), (1.5, 2.5), (4.0, 1.2)])
+def test_a_sharpened_photo_is_told_what_it_was_to_a_level(amount, radius):
+    color = 0.3 + 0.4 * textured(1)
+    sharpened = levels(Processor(0.0, amount, radius).recorded(color))
+    left = Processor(0.0, amount, radius).unsharpened(sharpened) - levels(color).astype(float)
+    assert np.abs(left).max() <= 2
+    assert left.std() < 0.7 < (sharpened - levels(color).astype(float)).std()
+
+
+def test_black_and_white_of_a_sharpened_photo_stay():
+    photo = np.uint8(np.random.default_rng(2).uniform(30, 220, (40, 50, 3)))
+    photo[:, :10], photo[10:20, 20:30, 0] = 0, 255
+    found = Processor(0.0, 0.8).unsharpened(photo)
+    kept = (photo.max(axis=2) == 0) | (photo.max(axis=2) == 255)
+    assert (found[kept] == photo[kept]).all() and (found[~kept] != photo[~kept]).any()
+
+
+def test_photos_that_were_not_sharpened_are_left_as_they_are():
+    photo = levels(textured(3))
+    assert (Processor(0.0, 0.0).unsharpened(photo) == photo).all()

@@ -44,6 +44,19 @@ def test_the_sharpening_put_in_comes_out(tmp_path, contrast, amount, radius_px):
     assert found.radius_px == pytest.approx(radius_px, rel=0.25)
 
 
+def test_what_is_found_undoes_most_of_it(tmp_path):
+    for folder in ("sharp", "plain"):
+        (tmp_path / folder).mkdir()
+    sharp = recording(tmp_path / "sharp", Processor(0.0, 0.8, 1.5))
+    plain, inside = recording(tmp_path / "plain"), sharp.well_lit(8)
+    found, _ = Processor.evidence(sharp)
+    was, left = (
+        (photo.astype(float) - plain.color(3))[inside].std()
+        for photo in (sharp.color(3), found.unsharpened(sharp.color(3)))
+    )
+    assert left < was / 3
+
+
 def test_a_jpeg_codec_leaves_it_told(tmp_path):
     found, _ = Processor.evidence(recording(tmp_path, Processor(0.3, 1.5, 2.0), Codec(85)))
     assert found.sharpening == pytest.approx(1.5, rel=0.25) and found.contrast == 0
