@@ -264,11 +264,11 @@ def photographed(radiance: np.ndarray, gain: float, drawn: Draw, rng: np.random.
     if drawn.defocus:
         linear = cv2.GaussianBlur(linear, (0, 0), drawn.defocus)
     shown = np.clip(linear**GAMMA + rng.normal(0, drawn.noise / 255, linear.shape), 0, 1)
+    v, u = np.indices(shown.shape[:2])
+    shown[~drawn.lens.lit(u, v)] = 0
     if drawn.sharpened:
         shown = np.clip(shown + drawn.sharpened * (shown - cv2.GaussianBlur(shown, (0, 0), 1.2)), 0, 1)
     shown = shown + drawn.tone * (3 * shown**2 - 2 * shown**3 - shown)
-    v, u = np.indices(shown.shape[:2])
-    shown[~drawn.lens.lit(u, v)] = 0
     photo = np.uint8(255 * shown + 0.5)
     if drawn.chroma:
         size, apart = photo.shape[1::-1], cv2.cvtColor(photo, cv2.COLOR_RGB2YCrCb)
