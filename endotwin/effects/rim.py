@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from numpy.polynomial.polynomial import polyval
 from scipy.optimize import OptimizeResult, least_squares
 from scipy.special import ndtr, stdtrit
 
@@ -37,9 +38,11 @@ DIMMEST, FEWEST = 512, 64
 MODEL = 0.01
 """What the mean profile may differ from a blurred and sharpened edge, as a share of its height."""
 
-LOWEST = np.array([-8.0, 0.2, 0.0, 0.3, 0.3, -0.1])
-HIGHEST = np.array([8.0, 4.0, 4.0, 3.0, 2.0, 0.1])
-"""Of the edge's place and blur in px, amount and radius in px of the sharpening, height, and slope per px."""
+LOWEST = np.array([-8.0, 0.2, 0.0, 0.3, 0.3, -0.1, -0.01])
+HIGHEST = np.array([8.0, 4.0, 4.0, 3.0, 2.0, 0.1, 0.01])
+"""Of the edge's place and blur in px, amount and radius in px of the sharpening, height, slope per px, and
+curvature per px², if that is looked for: it may pass for an overshoot, so that none would prove to be there
+beside it, but without it the amount of one that is there errs by more."""
 
 RADII_PX = (0.7, 1.5, 2.5)
 """That the search begins at."""
@@ -87,7 +90,7 @@ def _sure(profiles: np.ndarray, group: np.ndarray, groups: np.ndarray) -> Unshar
     starts = [np.array([place, 0.5, 0.3, radius, 1.0, 0.0]) for radius in RADII_PX]
     fit = min((_fitted(mean, error, start) for start in starts), key=lambda fit: fit.cost)
     best, amount_error = fit.x, _amount_error(fit)
-    near = np.clip(best, LOWEST + 0.01, HIGHEST - 0.01)
+    near = np.clip(best, LOWEST[: len(best)] + 0.01, HIGHEST[: len(best)] - 0.01)
     others = [_fitted(profiles[group != one].mean(axis=0), error, near).x for one in groups]
     spread = np.sqrt(len(groups) - 1)
     overshoot_error = spread * np.std([_overshoot(other) for other in others])
@@ -95,18 +98,20 @@ def _sure(profiles: np.ndarray, group: np.ndarray, groups: np.ndarray) -> Unshar
     least = MODEL + stdtrit(len(groups) - 1, 1 - CHANCE) * overshoot_error
     if _overshoot(best) <= least or amount_error > SURE * best[2]:
         return None
-    return Unsharp(float(best[2]), float(best[3]), float(_overshoot(best)))
+    _, _, amount, radius_px, *_ = _fitted(mean, error, np.r_[near, 0.0]).x
+    return Unsharp(float(amount), float(radius_px), float(_overshoot(best)))
 
 
 def _fitted(mean: np.ndarray, error: np.ndarray, start: np.ndarray) -> OptimizeResult:
-    """Parameters within LOWEST and HIGHEST of the edge nearest to a mean profile [bins]; in the black, where
-    a codec rings, it is not compared."""
+    """Parameters within LOWEST and HIGHEST, as many as ``start`` has, of the edge nearest to a mean profile
+    [bins]; in the black, where a codec rings, it is not compared."""
+    bounds = LOWEST[: len(start)], HIGHEST[: len(start)]
     seen = start[0] - 1 < DISTANCE_PX
 
     def residuals(parameters: np.ndarray) -> np.ndarray:
         return ((_edge(parameters) - mean) / error)[seen]
 
-    return least_squares(residuals, start, bounds=(LOWEST, HIGHEST), loss="soft_l1")
+    return least_squares(residuals, start, bounds=bounds, loss="soft_l1")
 
 
 def _amount_error(fit: OptimizeResult) -> float:
@@ -118,15 +123,15 @@ def _amount_error(fit: OptimizeResult) -> float:
 
 def _edge(parameters: np.ndarray) -> np.ndarray:
     """A blurred and sharpened edge at DISTANCE_PX."""
-    place, blur, amount, radius, height, slope = parameters
+    place, blur, amount, radius = parameters[:4]
     step = ndtr((DISTANCE_PX - place) / blur)
     detail = step - ndtr((DISTANCE_PX - place) / np.hypot(blur, radius))
-    return (height + slope * DISTANCE_PX) * np.maximum(step + amount * detail, 0)
+    return polyval(DISTANCE_PX, parameters[4:]) * np.maximum(step + amount * detail, 0)
 
 
 def _overshoot(parameters: np.ndarray) -> float:
     """Share by which an edge is at most brighter than what it rises to."""
-    return float((_edge(parameters) / (parameters[4] + parameters[5] * DISTANCE_PX)).max() - 1)
+    return float((_edge(parameters) / polyval(DISTANCE_PX, parameters[4:])).max() - 1)
 
 
 def _polar(lit: np.ndarray) -> tuple[np.ndarray, np.ndarray] | tuple[None, None]:

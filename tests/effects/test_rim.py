@@ -82,3 +82,13 @@ def test_path_traced_colons_without_a_processor_tell_none(data_root, kind):
 
 def test_a_path_traced_colon_that_was_sharpened_tells_so(data_root):
     assert unsharp(open_sequence(data_root / "colon_scope")).overshoot > 0.1
+
+
+def test_what_a_path_traced_colon_is_sharpened_by_comes_out_to_an_eighth(data_root, tmp_path):
+    """Its brightness is not even beside the edge, nor a straight line."""
+    sequence, processor = open_sequence(data_root / "colon_wet"), Processor(0.0, 0.8, 1.5)
+    photos = [sequence.color(index) for index in range(len(sequence))]
+    sharp = [levels(processor.recorded(np.float32(photo) / 255)) for photo in photos]
+    found = unsharp(photographed(tmp_path, sharp))
+    assert found.amount == pytest.approx(0.8, rel=1 / 8)
+    assert found.radius_px == pytest.approx(1.5, rel=1 / 8)
