@@ -167,7 +167,7 @@ def test_samples_carry_the_color_that_their_surface_point_has_under_their_incide
 
 def test_sharpened_photos_are_fitted_as_they_were_before(tube, monkeypatch):
     processor = Processor(0.0, 1.5, 1.2)
-    monkeypatch.setattr(Processor, "evidence", lambda sequence: (processor, "told by the lens circle"))
+    monkeypatch.setattr(Processor, "evidence", lambda *_: (processor, "told by the lens circle"))
     samples, sequence = gather(tube, Pace(FitConfig(pixels=10**9)), 0, Caster(tube.surface)), tube.sequence()
     for frame in samples.views.frames.tolist():
         here, photo = samples.frame.numpy() == frame, sequence.color(frame)

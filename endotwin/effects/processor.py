@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence as Indices
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -39,7 +40,7 @@ class Processor(Effect):
         """Display values float32 [H, W, 3] as the processor gives them out."""
         toned = Tone(self.contrast).shown(torch.from_numpy(color)).numpy()
         luma = toned @ LUMA
-        detail = luma - cv2.GaussianBlur(luma, (0, 0), self.radius, borderType=cv2.BORDER_REFLECT)
+        detail = luma - self._soft(luma)
         return np.clip(toned + np.float32(self.sharpening) * detail[..., None], 0, 1)
 
     def unsharpened(self, color: np.ndarray) -> np.ndarray:
@@ -53,16 +54,20 @@ class Processor(Effect):
         sharp = color @ LUMA
         luma = sharp
         for _ in range(math.ceil(math.log(CLOSE) / math.log(max(share, CLOSE)))):
-            soft = cv2.GaussianBlur(luma, (0, 0), self.radius, borderType=cv2.BORDER_REFLECT)
-            luma = (1 - share) * sharp + share * soft
+            luma = (1 - share) * sharp + share * self._soft(luma)
         restored = np.clip(color + (luma - sharp)[..., None] + 0.5, 0, 255).astype(np.uint8)
         brightest = color.max(axis=2, keepdims=True)
         return np.where((brightest > 0) & (brightest < 255), restored, color)
 
+    def _soft(self, luma: np.ndarray) -> np.ndarray:
+        """G ∗ Y of luminance float32 [H, W]."""
+        return cv2.GaussianBlur(luma, (0, 0), self.radius, borderType=cv2.BORDER_REFLECT)
+
     @classmethod
-    def evidence(cls, sequence: Sequence) -> tuple[Processor | None, str]:
-        """Sharpening where the edge of the lens circle overshoots; a tone curve is for a fit to tell."""
-        found = rim.unsharp(sequence)
+    def evidence(cls, sequence: Sequence, frames: Indices[int] | None = None) -> tuple[Processor | None, str]:
+        """Sharpening where the edge of the lens circle overshoots, in ``frames`` or all that are used; a tone
+        curve is for a fit to tell."""
+        found = rim.unsharp(sequence, frames)
         if found is None:
             return None, (
                 "rendered on request: no sharp edge of a lens circle overshoots, and elsewhere photos do not "

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence as Indices
 from dataclasses import dataclass
 
 import cv2
@@ -12,6 +13,7 @@ from scipy.special import ndtr, stdtrit
 
 from endotwin.effects.luma import LUMA
 from endotwin.sequence import Sequence
+from endotwin.sequence.spread import spread
 
 PHOTOS = 32
 """Spread over a sequence, whose rims are looked at."""
@@ -63,8 +65,9 @@ class Unsharp:
     overshoot: float
 
 
-def unsharp(sequence: Sequence) -> Unsharp | None:
-    """The sharpening that a sequence's photos underwent, by the mean profile of the lens circle's edge.
+def unsharp(sequence: Sequence, frames: Indices[int] | None = None) -> Unsharp | None:
+    """The sharpening that a sequence's photos underwent, by the mean profile of the lens circle's edge in
+    those of ``frames``, or of all that are used.
 
     Scenes know nothing of the circle, so what they show beside it is even in the mean, and a lens blurs the
     edge without overshoot: a step Φ(d/σ) is sharpened to Φ(d/σ) + a·(Φ(d/σ) − Φ(d/√(σ² + r²))), clipped at
@@ -74,7 +77,8 @@ def unsharp(sequence: Sequence) -> Unsharp | None:
     distance_px, sector = _polar(sequence.lens_mask)
     if distance_px is None:
         return None
-    photos = (sequence.color(index) for index in sequence.spread(PHOTOS))
+    some = sequence.spread(PHOTOS) if frames is None else np.asarray(frames)[spread(len(frames), PHOTOS)]
+    photos = (sequence.color(index) for index in some)
     found = np.concatenate([_profiles(photo, distance_px, sector) for photo in photos])
     found = found[np.argsort(found[:, 1])[:DIMMEST]]
     group, profiles = (found[:, 0] * GROUPS / SECTORS).astype(int), found[:, 2:]
@@ -92,9 +96,9 @@ def _sure(profiles: np.ndarray, group: np.ndarray, groups: np.ndarray) -> Unshar
     best, amount_error = fit.x, _amount_error(fit)
     near = np.clip(best, LOWEST[: len(best)] + 0.01, HIGHEST[: len(best)] - 0.01)
     others = [_fitted(profiles[group != one].mean(axis=0), error, near).x for one in groups]
-    spread = np.sqrt(len(groups) - 1)
-    overshoot_error = spread * np.std([_overshoot(other) for other in others])
-    amount_error = max(amount_error, spread * np.std([other[2] for other in others]))
+    jackknife = np.sqrt(len(groups) - 1)
+    overshoot_error = jackknife * np.std([_overshoot(other) for other in others])
+    amount_error = max(amount_error, jackknife * np.std([other[2] for other in others]))
     least = MODEL + stdtrit(len(groups) - 1, 1 - CHANCE) * overshoot_error
     if _overshoot(best) <= least or amount_error > SURE * best[2]:
         return None

@@ -16,7 +16,7 @@ from endotwin.fit.state import State
 from endotwin.light import shading
 from endotwin.light.film import Film, film_in_view
 from endotwin.light.guides import lamps_mm
-from endotwin.pixels.samples import Samples, Views, frame_samples
+from endotwin.pixels.samples import Samples, Views, frame_samples, unsharpened
 from endotwin.surface.casting import Caster
 from endotwin.twin import Twin
 
@@ -45,7 +45,7 @@ class Model:
     def photo(self, views: Views, row: int) -> Based:
         """All pixels of the photo of ``row`` among the ``views``, with what the model shows there."""
         twin, effects = self.twin, self.relighting.effects
-        frame = views.frame(twin.sequence(), int(views.frames[row]))
+        frame = unsharpened(twin.sequence().frame(int(views.frames[row])), views.processor)
         part = frame_samples(twin, self.caster, frame, views.lens_mask, 1.0, np.random.default_rng(0))
         return self.based(lit(Samples.joined([part], views), twin.surface, self.caster, effects))
 

@@ -23,7 +23,7 @@ from endotwin.fit.heal import REACH_PX, healed
 from endotwin.fit.lighting import lit
 from endotwin.fit.tilt import falling_on
 from endotwin.light.film import Film
-from endotwin.pixels.samples import Samples, frame_samples
+from endotwin.pixels.samples import Samples, frame_samples, unsharpened
 from endotwin.run.ahead import ahead
 from endotwin.run.threads import THREADS
 from endotwin.surface.silhouettes import dilated
@@ -111,7 +111,8 @@ def _about(judges: Based, report: Report) -> Samples:
     points_mm = twin.surface.vertices_mm[judges.vertices()]
 
     def one(row: int) -> Samples:
-        frame, pose = views.frame(sequence, int(views.frames[row])), views.T_local_camera[row]
+        frame = unsharpened(sequence.frame(int(views.frames[row])), views.processor)
+        pose = views.T_local_camera[row]
         near = _splatted(views.camera, (points_mm - pose[:3, 3]) @ pose[:3, :3])
         share = MOST / len(views.frames) / max(1, int(near.sum()))
         return frame_samples(

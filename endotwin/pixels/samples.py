@@ -22,7 +22,7 @@ from endotwin.pixels.length_unit import unit_mm
 from endotwin.pixels.pace import Pace
 from endotwin.run.ahead import ahead
 from endotwin.run.threads import THREADS
-from endotwin.sequence import Frame, Sequence, Split
+from endotwin.sequence import Frame
 from endotwin.surface import Surface
 from endotwin.surface.casting import Caster, Correspondences
 from endotwin.surface.rows import chosen
@@ -58,13 +58,6 @@ class Views:
     frames: np.ndarray
     T_local_camera: np.ndarray
     processor: Processor | None = None
-
-    def frame(self, sequence: Sequence, index: int) -> Frame:
-        """Frame ``index`` with its photo as it was before it was sharpened."""
-        frame = sequence.frame(index)
-        if self.processor is None:
-            return frame
-        return replace(frame, color=self.processor.unsharpened(frame.color))
 
     def row(self, frame: Tensor) -> np.ndarray:
         """Where frames [N] stand among ``frames``, int [N]."""
@@ -229,15 +222,12 @@ def gather(twin: Twin, pace: Pace, seed: int, caster: Caster) -> Samples:
     sequence = twin.sequence()
     frames = twin.source.training(len(sequence))
     share = pace.share(len(frames), int(sequence.lens_mask.sum()))
-    T_local_camera = twin.surface.to_local(sequence.T_world_camera[list(frames)])
-    processor, _ = Processor.evidence(replace(sequence, split=Split(tuple(frames), ())))
-    views = Views(twin.camera, sequence.lens_mask, np.array(frames), T_local_camera, processor)
+    processor, _ = Processor.evidence(sequence, frames)
 
     def one(index: int) -> tuple[int, Samples]:
         generator = np.random.default_rng((seed, index))
-        return index, frame_samples(
-            twin, caster, views.frame(sequence, index), views.lens_mask, share, generator
-        )
+        frame = unsharpened(sequence.frame(index), processor)
+        return index, frame_samples(twin, caster, frame, sequence.lens_mask, share, generator)
 
     read, parts = [], []
     for done, (index, part) in enumerate(ahead(one, pace.photos(frames), THREADS), 1):
@@ -250,9 +240,15 @@ def gather(twin: Twin, pace: Pace, seed: int, caster: Caster) -> Samples:
             logger.warning("%s is black or clipped and is not fitted", sequence.color_files[index])
     parts = [part for part, tells in zip(parts, shows, strict=True) if tells or not any(shows)]
     joined = Samples.joined(parts)
-    shown = np.isin(views.frames, joined.frame.numpy())
-    views = replace(views, frames=views.frames[shown], T_local_camera=T_local_camera[shown])
+    shown = np.unique(joined.frame.numpy())
+    T_local_camera = twin.surface.to_local(sequence.T_world_camera[shown])
+    views = Views(twin.camera, sequence.lens_mask, shown, T_local_camera, processor)
     return replace(joined[torch.argsort(joined.triangle, stable=True)], views=views)
+
+
+def unsharpened(frame: Frame, processor: Processor | None) -> Frame:
+    """The frame with its photo as it was before ``processor`` sharpened it, if one did."""
+    return frame if processor is None else replace(frame, color=processor.unsharpened(frame.color))
 
 
 def _shown(part: Samples) -> float:
