@@ -7,7 +7,7 @@ Colon and path are those of examples/make_colon_small.py. Light guides, bounces 
 coat, vignetting, a gain that meters each photo, defocus, noise, and what a video processor does to a photo,
 tone curve, sharpening, chroma at half size and JPEG, each come by chance; so do poses that err as a
 registration does, with depth of the true surface there. ``truth/made.json`` says what a scene has. Of
-endotwin there is nothing in it but the casting of depth maps. A scene takes some five minutes.
+endotwin there is nothing in it but the casting of depth maps. A scene takes some ten minutes.
 """
 
 from __future__ import annotations
@@ -43,6 +43,9 @@ GUIDES_MM = {
 }
 SPLIT = 3
 """Each pixel is the mean of so many times so many rays."""
+
+PATHS = 20
+"""Paths of bounced light a pixel: five left it uneven by 15 %, far off by 24 %, which hid guides."""
 
 BRIGHTEST = 0.9995
 """Quantile of bounced light at which it is cut: single paths of much light are noise."""
@@ -172,15 +175,16 @@ class Studio:
             guide.place(T[:3, :3] @ at_mm + T[:3, 3], T[:3, 2])
         v, u = np.indices((lens.height, lens.width)).reshape(2, -1)
         rng = np.random.default_rng([drawn.seed, 5, frame])
-        direct, bounced, bouncing = 0.0, 0.0, range(0, SPLIT**2, 2)
-        for ray in range(SPLIT**2):
-            aside = (np.array([ray % SPLIT, ray // SPLIT]) + rng.random((len(u), 2))) / SPLIT - 0.5
+        direct, bounced, paths = 0.0, 0.0, PATHS if drawn.bounces else 0
+        for ray in range(max(SPLIT**2, paths)):
+            aside = (np.array([ray % SPLIT, ray // SPLIT % SPLIT]) + rng.random((len(u), 2))) / SPLIT - 0.5
             world = lens.rays(u + aside[:, 0], v + aside[:, 1]) @ T[:3, :3].T
             seed = int(rng.integers(2**31))
-            direct = direct + sum(self._shot(self._direct, each, T, world, seed) for each in self._alone)
-            if drawn.bounces and ray in bouncing:
+            if ray < SPLIT**2:
+                direct = direct + sum(self._shot(self._direct, each, T, world, seed) for each in self._alone)
+            if ray < paths:
                 both = (self._shot(each, self._scene, T, world, seed) for each in (self._all, self._direct))
-                bounced = bounced + np.subtract(*both) / len(bouncing)
+                bounced = bounced + np.subtract(*both) / paths
         image = direct.reshape(lens.height, lens.width, 3) / SPLIT**2
         return image + self._smoothed(bounced, T) if drawn.bounces else image
 

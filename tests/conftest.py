@@ -16,6 +16,10 @@ import tube_sequence
 import endotwin
 from endotwin.run import locks
 
+if "PYTEST_XDIST_WORKER" in os.environ and hasattr(os, "sched_setaffinity"):  # each has cores of its own
+    number, count = (int(os.environ[f"PYTEST_XDIST_WORKER{name}"].lstrip("gw")) for name in ("", "_COUNT"))
+    os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[number::count] or os.sched_getaffinity(0))
+
 
 @pytest.fixture(scope="session")
 def data_root() -> Path:

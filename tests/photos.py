@@ -1,5 +1,6 @@
 """Photos of texture with known effects, as sequences of files."""
 
+from functools import cache
 from pathlib import Path
 
 import cv2
@@ -21,13 +22,16 @@ def photographed(folder: Path, photos: list[np.ndarray]) -> Sequence:
     return Sequence(folder, "c3vd", camera, poses, files, (), lambda file: None, np.arange(len(files)) / 30)
 
 
+@cache
 def textured(seed: int, height: int = 240, width: int = 320) -> np.ndarray:
     """Smooth reddish texture at four scales, float32 [H, W, 3] in [0, 1]."""
     rng = np.random.default_rng(seed)
     grains = [(size, rng.standard_normal((height, width))) for size in (1.5, 3, 8, 25)]
     shade = sum(size * cv2.GaussianBlur(grain, (0, 0), size) for size, grain in grains)
     shade = 0.5 + 0.12 * shade / shade.std()
-    return np.stack([shade, 0.7 * shade + 0.05, 0.5 * shade], axis=2).astype(np.float32)
+    color = np.stack([shade, 0.7 * shade + 0.05, 0.5 * shade], axis=2).astype(np.float32)
+    color.setflags(write=False)
+    return color
 
 
 def levels(color: np.ndarray, noise_levels: float = 0.0, seed: int = 0) -> np.ndarray:

@@ -33,7 +33,7 @@ from endotwin.evidence.guide_search import Ground, Guides, Search, found_guides,
 from endotwin.evidence.log_light import Bounced
 from endotwin.evidence.probe import Fitted, Hypothesis, Probe
 from endotwin.evidence.verdict import MIN_GAIN_DB, MIN_IMPOSSIBLE_DB, MIN_SIGMAS, Verdict
-from endotwin.evidence.worth import BARE, LEAST, UNSHADED_DB, more_usual, worth
+from endotwin.evidence.worth import BARE, LEAST, more_usual, worth
 from endotwin.light.guides import AT_LENS, COSINE, EXPONENTIAL
 from endotwin.pixels.samples import Samples
 from endotwin.pixels.start import PRIOR
@@ -173,7 +173,7 @@ class _Trial:
             reason = "light at the lens casts no shadow that the lens sees"
             self._decisions["shadows"] = Decision("off", reason)
             return kept
-        unshadowed, verdict = self._without_shadows(kept)
+        unshadowed, verdict = self._ground.unshadowed(kept)
         cast = self._probe.shaded_db(kept) >= MIN_GAIN_DB and verdict.sigmas > -MIN_SIGMAS
         on = self.wanted("shadows") == "on" or (self.wanted("shadows") == "auto" and cast)
         self._say("shadows", on, verdict)
@@ -317,12 +317,9 @@ class _Trial:
 
     def _worth_within(self, names: frozenset[str], name: str, verdict: Verdict) -> bool:
         model = self._model(names)
-        found = worth(name, verdict, model)
-        if name == "gain":
-            return found and self._gain_is_plain(names)
         if name == "offset":
-            return (found and self._borne_out(model, verdict)) or self._ground.certain(model, verdict)
-        return found
+            return self._ground.borne_out(model, verdict) or self._ground.certain(model, verdict)
+        return worth(name, verdict, model) and (name != "gain" or self._gain_is_plain(names))
 
     def _no_uneven_bounce(self, names: frozenset[str]) -> bool:
         """Whether the gain among ``names`` explains more than bounced light of another strength in each frame
@@ -332,18 +329,6 @@ class _Trial:
             return True
         uneven = self._probe.fit(replace(without, uneven=True))
         return self._probe.compare(uneven, self._model(names)).sigmas >= MIN_SIGMAS
-
-    def _borne_out(self, model: Fitted, verdict: Verdict) -> bool:
-        """Whether guides of ``model`` gain more, by their ``verdict``, than a bounce errs by, or cast shadows
-        that show."""
-        if model.hypothesis.bounced is None or verdict.gain_db >= UNSHADED_DB:
-            return True
-        return self._without_shadows(model)[1].sigmas >= MIN_SIGMAS
-
-    def _without_shadows(self, model: Fitted) -> tuple[Fitted, Verdict]:
-        """``model`` with guides that cast no shadows, and what shadows say of those of the ``model``."""
-        unshadowed = self._probe.fit(replace(model.hypothesis, shadows=False))
-        return unshadowed, self._probe.told_by_shadows(model, unshadowed)
 
     def _verdict(self, without: frozenset[str], names: frozenset[str]) -> Verdict:
         return self._probe.compare(self._model(without), self._model(names))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cache, cached_property, lru_cache
+from itertools import chain
 
 import numpy as np
 from scipy.optimize import least_squares
@@ -11,8 +12,8 @@ from scipy.optimize import least_squares
 from endotwin.evidence.glints import MOST_GUIDES, Glints
 from endotwin.evidence.light_map import LightMap, places_mm
 from endotwin.evidence.probe import Fitted, Hypothesis, Probe
-from endotwin.evidence.verdict import Verdict
-from endotwin.evidence.worth import hints_at_guides, worth, worth_another
+from endotwin.evidence.verdict import MIN_SIGMAS, Verdict
+from endotwin.evidence.worth import LEAST, hints_at_guides, worth, worth_another
 from endotwin.light.guides import AT_LENS
 from endotwin.pixels.fixed_effects import Design, Left
 
@@ -38,6 +39,9 @@ DEEPEST = 1.0
 ASIDE = 0.1
 """Of the radius: by so much guides are moved to find what their positions change. With less, the
 shadows that jump from pixel to pixel hide it."""
+
+SHADOWED_HINT = Verdict(0.0, 1.0)
+"""What guides have to gain, and their shadows alone, for a closer look at where they are."""
 
 
 class Ground:
@@ -76,6 +80,18 @@ class Ground:
             visible[self._at_risk, k] = self._seen(tuple(map(float, guide)))
         return visible
 
+    def borne_out(self, model: Fitted, verdict: Verdict) -> bool:
+        """Whether guides of ``model`` gain what is worth their place by their ``verdict``, or something, and
+        cast shadows that show: no light that is a little wrong throws those."""
+        if worth("offset", verdict, model):
+            return True
+        return verdict.worth(LEAST) and self.unshadowed(model)[1].sigmas >= MIN_SIGMAS
+
+    def unshadowed(self, model: Fitted) -> tuple[Fitted, Verdict]:
+        """``model`` with guides that cast no shadows, and what shadows say of those of the ``model``."""
+        unshadowed = self.probe.fit(replace(model.hypothesis, shadows=False))
+        return unshadowed, self.probe.told_by_shadows(model, unshadowed)
+
     def certain(self, model: Fitted, verdict: Verdict) -> bool:
         """Whether glints plainly stand about the guides of ``model``, and the pixels' ``verdict`` on it does
         not plainly contradict them."""
@@ -106,7 +122,7 @@ def found_guides(ground: Ground, base: Hypothesis, forced: bool, near_mm: Guides
     if near_mm != AT_LENS:
         near = replace(base, guides_mm=near_mm, shadows=True)
         near = under(Search(ground.part, near).settled())
-        if worth("offset", probe.compare(plain, near), near):
+        if ground.borne_out(near, probe.compare(plain, near)):
             return near.hypothesis.guides_mm
     search, told = Search(ground.part, base), ground.glints.told()
     if not (forced or told or search.hints()):
@@ -117,14 +133,34 @@ def found_guides(ground: Ground, base: Hypothesis, forced: bool, near_mm: Guides
             best, first = found, told + 1
     for number in range(first, MOST_GUIDES + 1):
         found = under(search.best(number))
-        if best is None:
-            better = worth("offset", probe.compare(plain, found), found)
-        else:
-            better = worth_another(probe.compare(best, found), found)
-            better = better and worth_another(probe.compare(settled(ground, best), found), found)
+        better, found = (_first if best is None else _another)(ground, best or plain, found)
         if better or (forced and best is None and number == MOST_GUIDES):
             best = found
     return AT_LENS if best is None else Search(ground.part, best.hypothesis).settled()
+
+
+def _first(ground: Ground, plain: Fitted, found: Fitted) -> tuple[bool, Fitted]:
+    """Whether the guides of ``found`` are worth their place beside the ``plain`` light at the lens; and they,
+    where all pixels say that they are if that is in doubt."""
+    verdict = ground.probe.compare(plain, found)
+    if ground.borne_out(found, verdict):
+        return True, found
+    if not (verdict.worth(SHADOWED_HINT) and ground.unshadowed(found)[1].sigmas >= SHADOWED_HINT.sigmas):
+        return False, found
+    found = polished(ground, found)
+    return ground.borne_out(found, ground.probe.compare(plain, found)), found
+
+
+def _another(ground: Ground, best: Fitted, found: Fitted) -> tuple[bool, Fitted]:
+    """Whether the guides of ``found`` are worth it beside the ``best`` of one less; and they, where all
+    pixels say that they are if that is in doubt."""
+    verdict = ground.probe.compare(best, found)
+    if worth_another(verdict, found):
+        return worth_another(ground.probe.compare(settled(ground, best), found), found), found
+    if not verdict.hints:
+        return False, found
+    found = polished(ground, found)
+    return worth_another(ground.probe.compare(polished(ground, best), found), found), found
 
 
 def settled(ground: Ground, model: Fitted) -> Fitted:
@@ -157,9 +193,11 @@ class Search:
         return LightMap.of(self._probe, self._base, self._ground.places_mm, self._ground.lit)
 
     def hints(self) -> bool:
-        """Whether one guide, wherever it is best, or two or three where light gathers predict better."""
-        more = [start for number in range(2, MOST_GUIDES + 1) for start in self._starts(number)]
-        models = [self._probe.fit(self._with(each)) for each in (self.best(1), *more)]
+        """Whether one guide, wherever it is best, or two or three near where light gathers predict better."""
+        more = (
+            self._refined(min(self._starts(number), key=self._loss)) for number in range(2, MOST_GUIDES + 1)
+        )
+        models = (self._probe.fit(self._with(each)) for each in chain((self.best(1),), more))
         return any(hints_at_guides(self._probe.compare(self._base, model), model) for model in models)
 
     def _best(self, number: int) -> Guides:

@@ -10,7 +10,7 @@ import math
 
 from endotwin.effects.noise import LEVEL
 from endotwin.evidence.probe import Fitted
-from endotwin.evidence.verdict import MIN_GAIN_DB, Verdict
+from endotwin.evidence.verdict import MIN_GAIN_DB, MIN_SIGMAS, Verdict
 
 LEAST = Verdict(0.05, 3.0)
 """What is enough for two effects. Bounced light has no coefficient of its own, so that where there is none it
@@ -26,9 +26,9 @@ ANOTHER = Verdict(BARE_HINT.gain_db, BARE.sigmas)
 """What one guide more has to gain beside those that are found: what says that there are any need not say it
 once more. Of seventeen random scenes none gained more than 3.2 sigmas by one too many."""
 
-UNSHADED_DB = 0.5
+UNSHADED = Verdict(0.5, MIN_SIGMAS)
 """What guides beside bounced light have to gain where their shadows do not show: on two random scenes with
-light at the lens they had gained 0.24 and 0.29, on two with guides 0.9 and 8."""
+light at the lens they had gained 0.24 and 0.29 dB, on two with guides 0.9 and 8."""
 
 ROUNDING = LEVEL / math.sqrt(12)
 """What rounding to 8 bits does to ln of white, root mean square. Vignetting that explains more is worth its
@@ -50,13 +50,14 @@ def worth(name: str, verdict: Verdict, model: Fitted) -> bool:
         return plain or verdict.worth(LEAST)
     if name == "interreflection":
         return verdict.worth(LEAST) or more_usual(verdict)
-    return verdict.keep or (name == "offset" and not bounces and verdict.worth(BARE))
+    if name == "offset" and bounces:
+        return verdict.worth(UNSHADED)
+    return verdict.keep or (name == "offset" and verdict.worth(BARE))
 
 
 def worth_another(verdict: Verdict, model: Fitted) -> bool:
     """Whether the guides of ``model`` are worth it by the ``verdict`` on it beside one guide less."""
-    bare = model.hypothesis.bounced is None
-    return worth("offset", verdict, model) or (bare and verdict.worth(ANOTHER))
+    return verdict.keep or (model.hypothesis.bounced is None and verdict.worth(ANOTHER))
 
 
 def explained(verdict: Verdict, model: Fitted) -> float:

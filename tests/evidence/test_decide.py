@@ -13,9 +13,10 @@ from independent.write import make
 
 from endotwin.config import STANDARD
 from endotwin.effects.vignetting import Vignetting
+from endotwin.evidence.bounce import Surroundings
 from endotwin.evidence.decide import _Trial, decide
 from endotwin.evidence.glints import Glints
-from endotwin.evidence.guide_search import Ground, found_guides
+from endotwin.evidence.guide_search import Ground, _another, _first, found_guides
 from endotwin.evidence.probe import Hypothesis, Probe
 from endotwin.evidence.verdict import Verdict
 from endotwin.light.guides import AT_LENS
@@ -264,18 +265,45 @@ def test_shadows_are_cast_by_guides_unless_hardly_a_pixel_lies_in_one_or_many_co
 @needs_data
 def test_guides_that_gain_little_beside_a_bounce_are_borne_out_by_shadows_that_show(lit_from_beside):
     twin, caster, samples, glints = lit_from_beside
-    trial = _Trial(Probe(samples, twin, caster), glints, {}, lambda: False, AT_LENS)
+    ground = Ground(Probe(samples, twin, caster), glints())
 
     def borne_out(guides_mm, gain_db: float, bounces: bool = True) -> bool:
-        guides_mm = tuple(map(tuple, guides_mm))
-        bounced = trial._bouncing(guides_mm) if bounces else None
-        model = trial._probe.fit(Hypothesis(guides_mm, shadows=True, bounced=bounced))
-        return trial._borne_out(model, Verdict(gain_db, 5.0))
+        light = Hypothesis(tuple(map(tuple, guides_mm)), shadows=True)
+        bounced = Surroundings(ground.probe).bounced(light) if bounces else None
+        return ground.borne_out(ground.probe.fit(replace(light, bounced=bounced)), Verdict(gain_db, 5.0))
 
     nearly_at_lens = np.multiply(GUIDES_MM, [0.01, 0.01, 1])
-    assert borne_out(GUIDES_MM, 0.3)
+    assert borne_out(GUIDES_MM, 0.06) and not borne_out(GUIDES_MM, 0.04)
     assert not borne_out(nearly_at_lens, 0.3)
     assert borne_out(nearly_at_lens, 0.3, bounces=False) and borne_out(nearly_at_lens, 0.6)
+
+
+@pytest.mark.parametrize(("judged", "stay"), [(_first, 0), (_another, 1)])
+def test_guides_in_doubt_are_judged_where_all_pixels_say_that_they_are(example, monkeypatch, judged, stay):
+    """Some pixels put them beside it, where they gain too little."""
+    twin, caster, samples, glints = example
+    ground = Ground(Probe(samples, twin, caster), glints())
+    others = tuple((0.0, 2.0 + k, 0.0) for k in range(stay))
+    rough, exact = (*others, (2.0, 0.0, 0.0)), (*others, (2.5, 0.0, 0.0))
+    by_shadows = [2.0]
+
+    def compared(probe, base, other) -> Verdict:
+        return Verdict(0.25, 4) if exact == other.hypothesis.guides_mm else Verdict(0.15, 2.5)
+
+    def polished(ground, model):
+        found = model.hypothesis.guides_mm == rough
+        return ground.probe.fit(replace(model.hypothesis, guides_mm=exact)) if found else model
+
+    monkeypatch.setattr(Probe, "compare", compared)
+    monkeypatch.setattr("endotwin.evidence.guide_search.polished", polished)
+    monkeypatch.setattr(Ground, "unshadowed", lambda ground, model: (model, Verdict(0.1, by_shadows[0])))
+    beside = ground.probe.fit(Hypothesis(others or AT_LENS, shadows=bool(others)))
+    found = ground.probe.fit(Hypothesis(rough, shadows=True))
+    better, model = judged(ground, beside, found)
+    assert better and model.hypothesis.guides_mm == exact
+    if judged is _first:
+        by_shadows[0] = -1.0
+        assert judged(ground, beside, found) == (False, found)
 
 
 @pytest.mark.parametrize(

@@ -18,9 +18,9 @@ def model(bounces: bool, leaves: float = 0.005) -> SimpleNamespace:
 
 
 def test_guides_that_gain_little_are_worth_their_place_only_where_no_light_bounces():
-    little, usual = Verdict(0.06, 6), Verdict(0.25, 4)
-    assert worth("offset", little, model(bounces=False)) and not worth("offset", little, model(bounces=True))
-    assert worth("offset", usual, model(bounces=True))
+    little, usual, much = Verdict(0.06, 6), Verdict(0.25, 4), Verdict(0.55, 4)
+    assert worth("offset", little, model(bounces=False)) and worth("offset", usual, model(bounces=False))
+    assert not worth("offset", usual, model(bounces=True)) and worth("offset", much, model(bounces=True))
 
 
 def test_vignetting_that_explains_more_than_rounding_is_worth_its_place_however_much_is_left():
