@@ -40,7 +40,7 @@ ASIDE = 0.1
 """Of the radius: by so much guides are moved to find what their positions change. With less, the
 shadows that jump from pixel to pixel hide it."""
 
-SHADOWED_HINT = Verdict(0.0, 1.0)
+DOUBT = Verdict(0.0, 1.0)
 """What guides have to gain, and their shadows alone, for a closer look at where they are."""
 
 
@@ -86,6 +86,11 @@ class Ground:
         if worth("offset", verdict, model):
             return True
         return verdict.worth(LEAST) and self.unshadowed(model)[1].sigmas >= MIN_SIGMAS
+
+    def in_doubt(self, model: Fitted, verdict: Verdict) -> bool:
+        """Whether guides of ``model`` may be worth their place near where they are: they gain by their
+        ``verdict``, and so do their shadows alone."""
+        return verdict.worth(DOUBT) and self.unshadowed(model)[1].sigmas >= DOUBT.sigmas
 
     def unshadowed(self, model: Fitted) -> tuple[Fitted, Verdict]:
         """``model`` with guides that cast no shadows, and what shadows say of those of the ``model``."""
@@ -133,25 +138,26 @@ def found_guides(ground: Ground, base: Hypothesis, forced: bool, near_mm: Guides
             best, first = found, told + 1
     for number in range(first, MOST_GUIDES + 1):
         found = under(search.best(number))
-        better, found = (_first if best is None else _another)(ground, best or plain, found)
+        judge = _judged if best is None else _judged_another
+        better, found = judge(ground, best or plain, found)
         if better or (forced and best is None and number == MOST_GUIDES):
             best = found
     return AT_LENS if best is None else Search(ground.part, best.hypothesis).settled()
 
 
-def _first(ground: Ground, plain: Fitted, found: Fitted) -> tuple[bool, Fitted]:
+def _judged(ground: Ground, plain: Fitted, found: Fitted) -> tuple[bool, Fitted]:
     """Whether the guides of ``found`` are worth their place beside the ``plain`` light at the lens; and they,
     where all pixels say that they are if that is in doubt."""
     verdict = ground.probe.compare(plain, found)
     if ground.borne_out(found, verdict):
         return True, found
-    if not (verdict.worth(SHADOWED_HINT) and ground.unshadowed(found)[1].sigmas >= SHADOWED_HINT.sigmas):
+    if not ground.in_doubt(found, verdict):
         return False, found
     found = polished(ground, found)
     return ground.borne_out(found, ground.probe.compare(plain, found)), found
 
 
-def _another(ground: Ground, best: Fitted, found: Fitted) -> tuple[bool, Fitted]:
+def _judged_another(ground: Ground, best: Fitted, found: Fitted) -> tuple[bool, Fitted]:
     """Whether the guides of ``found`` are worth it beside the ``best`` of one less; and they, where all
     pixels say that they are if that is in doubt."""
     verdict = ground.probe.compare(best, found)
@@ -186,28 +192,31 @@ class Search:
     def __init__(self, ground: Ground, base: Hypothesis):
         self._ground, self._probe = ground, ground.probe
         self._base = self._probe.fit(ground.of(base))
-        self.best = cache(self._best)
+        self.best, self._from = cache(self._best), cache(self._refined)
 
     @cached_property
     def _map(self) -> LightMap:
         return LightMap.of(self._probe, self._base, self._ground.places_mm, self._ground.lit)
 
     def hints(self) -> bool:
-        """Whether one guide, wherever it is best, or two or three near where light gathers predict better."""
-        more = (
-            self._refined(min(self._starts(number), key=self._loss)) for number in range(2, MOST_GUIDES + 1)
-        )
-        models = (self._probe.fit(self._with(each)) for each in chain((self.best(1),), more))
-        return any(hints_at_guides(self._probe.compare(self._base, model), model) for model in models)
+        """Whether one guide, wherever it is best, or two or three near where light gathers predict better, or
+        a little, and so do their shadows."""
+        starts = (min(self._starts(number), key=self._loss) for number in range(2, MOST_GUIDES + 1))
+        return any(map(self._hint, chain((self.best(1),), map(self._from, starts))))
+
+    def _hint(self, guides_mm: Guides) -> bool:
+        model = self._probe.fit(self._with(guides_mm))
+        verdict = self._probe.compare(self._base, model)
+        return hints_at_guides(verdict, model) or self._ground.in_doubt(model, verdict)
 
     def _best(self, number: int) -> Guides:
         """The best positions of so many guides."""
-        return min((self._refined(start) for start in self._starts(number)), key=self._loss)
+        return min(map(self._from, self._starts(number)), key=self._loss)
 
-    def _starts(self, number: int) -> list[np.ndarray]:
+    def _starts(self, number: int) -> list[Guides]:
         """Where so many guides are sought from: where light gathers, and where the glints say."""
         told = self._ground.glints.guides_mm(number)
-        return [*self._map.guides_mm(number), *([told] if len(told) else [])]
+        return [_plain(start) for start in (*self._map.guides_mm(number), told) if len(start)]
 
     def settled(self) -> Guides:
         """The base's own guides, moved to where they predict best beside its effects."""
@@ -217,7 +226,7 @@ class Search:
         """As ``settled``, for guides that were sought in the plane of the lens."""
         return self._refined(self._refined(self._base.hypothesis.guides_mm), axes=3)
 
-    def _refined(self, start_mm: Guides | np.ndarray, axes: int = 2) -> Guides:
+    def _refined(self, start_mm: Guides, axes: int = 2) -> Guides:
         """Guides moved from ``start_mm`` [K, 3] by Gauss–Newton, in the plane of the lens, or along 3
         axes."""
 
@@ -240,7 +249,7 @@ class Search:
         found = least_squares(residuals, first, slopes, xtol=TOLERANCE, ftol=TOLERANCE, max_nfev=STEPS)
         return _plain(self._guides(found.x, axes))
 
-    def _coordinates(self, guides_mm: Guides | np.ndarray, axes: int) -> np.ndarray:
+    def _coordinates(self, guides_mm: Guides, axes: int) -> np.ndarray:
         """The first so many coordinates of K guides in radii, [K · axes]."""
         return np.asarray(guides_mm, np.float64)[:, :axes].ravel() / self._ground.radius_mm
 

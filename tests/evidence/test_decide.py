@@ -16,7 +16,7 @@ from endotwin.effects.vignetting import Vignetting
 from endotwin.evidence.bounce import Surroundings
 from endotwin.evidence.decide import _Trial, decide
 from endotwin.evidence.glints import Glints
-from endotwin.evidence.guide_search import Ground, _another, _first, found_guides
+from endotwin.evidence.guide_search import Ground, _judged, _judged_another, found_guides
 from endotwin.evidence.probe import Hypothesis, Probe
 from endotwin.evidence.verdict import Verdict
 from endotwin.light.guides import AT_LENS
@@ -267,18 +267,22 @@ def test_guides_that_gain_little_beside_a_bounce_are_borne_out_by_shadows_that_s
     twin, caster, samples, glints = lit_from_beside
     ground = Ground(Probe(samples, twin, caster), glints())
 
-    def borne_out(guides_mm, gain_db: float, bounces: bool = True) -> bool:
+    def model(guides_mm, bounces: bool = True):
         light = Hypothesis(tuple(map(tuple, guides_mm)), shadows=True)
         bounced = Surroundings(ground.probe).bounced(light) if bounces else None
-        return ground.borne_out(ground.probe.fit(replace(light, bounced=bounced)), Verdict(gain_db, 5.0))
+        return ground.probe.fit(replace(light, bounced=bounced))
 
-    nearly_at_lens = np.multiply(GUIDES_MM, [0.01, 0.01, 1])
-    assert borne_out(GUIDES_MM, 0.06) and not borne_out(GUIDES_MM, 0.04)
-    assert not borne_out(nearly_at_lens, 0.3)
-    assert borne_out(nearly_at_lens, 0.3, bounces=False) and borne_out(nearly_at_lens, 0.6)
+    there, nearly_at_lens = model(GUIDES_MM), model(np.multiply(GUIDES_MM, [0.01, 0.01, 1]))
+    without_bounce = model(np.multiply(GUIDES_MM, [0.01, 0.01, 1]), bounces=False)
+    assert ground.borne_out(there, Verdict(0.06, 5)) and not ground.borne_out(there, Verdict(0.04, 5))
+    assert not ground.borne_out(nearly_at_lens, Verdict(0.3, 5))
+    assert ground.borne_out(without_bounce, Verdict(0.3, 5))
+    assert ground.borne_out(nearly_at_lens, Verdict(0.6, 5))
+    assert ground.in_doubt(there, Verdict(0.01, 1.5)) and not ground.in_doubt(there, Verdict(-0.01, -1))
+    assert not ground.in_doubt(nearly_at_lens, Verdict(0.01, 1.5))
 
 
-@pytest.mark.parametrize(("judged", "stay"), [(_first, 0), (_another, 1)])
+@pytest.mark.parametrize(("judged", "stay"), [(_judged, 0), (_judged_another, 1)])
 def test_guides_in_doubt_are_judged_where_all_pixels_say_that_they_are(example, monkeypatch, judged, stay):
     """Some pixels put them beside it, where they gain too little."""
     twin, caster, samples, glints = example
@@ -301,7 +305,7 @@ def test_guides_in_doubt_are_judged_where_all_pixels_say_that_they_are(example, 
     found = ground.probe.fit(Hypothesis(rough, shadows=True))
     better, model = judged(ground, beside, found)
     assert better and model.hypothesis.guides_mm == exact
-    if judged is _first:
+    if judged is _judged:
         by_shadows[0] = -1.0
         assert judged(ground, beside, found) == (False, found)
 
