@@ -13,7 +13,7 @@ from endotwin.evidence.glints import MOST_GUIDES, Glints
 from endotwin.evidence.light_map import LightMap, places_mm
 from endotwin.evidence.probe import Fitted, Hypothesis, Probe
 from endotwin.evidence.verdict import MIN_SIGMAS, Verdict
-from endotwin.evidence.worth import LEAST, hints_at_guides, worth, worth_another
+from endotwin.evidence.worth import DOUBT, LEAST, hints_at_guides, worth, worth_another
 from endotwin.light.guides import AT_LENS
 from endotwin.pixels.fixed_effects import Design, Left
 
@@ -40,9 +40,6 @@ ASIDE = 0.1
 """Of the radius: by so much guides are moved to find what their positions change. With less, the
 shadows that jump from pixel to pixel hide it."""
 
-DOUBT = Verdict(0.0, 1.0)
-"""What guides have to gain, and their shadows alone, for a closer look at where they are."""
-
 
 class Ground:
     """What guides are sought on: pixels of a probe and its glints, and which pixels places about the lens
@@ -57,6 +54,7 @@ class Ground:
         self.radius_mm = RADIUS * probe.samples.distance_mm
         self.places_mm = places_mm(self.radius_mm)
         self._seen = lru_cache(SEEN_GUIDES)(lambda guide: probe.visible(np.float32(guide), self._at_risk))
+        self.unshadowed = lru_cache(1)(self._unshadowed)
 
     @cached_property
     def part(self) -> Ground:
@@ -92,7 +90,7 @@ class Ground:
         ``verdict``, and so do their shadows alone."""
         return verdict.worth(DOUBT) and self.unshadowed(model)[1].sigmas >= DOUBT.sigmas
 
-    def unshadowed(self, model: Fitted) -> tuple[Fitted, Verdict]:
+    def _unshadowed(self, model: Fitted) -> tuple[Fitted, Verdict]:
         """``model`` with guides that cast no shadows, and what shadows say of those of the ``model``."""
         unshadowed = self.probe.fit(replace(model.hypothesis, shadows=False))
         return unshadowed, self.probe.told_by_shadows(model, unshadowed)

@@ -26,6 +26,9 @@ ANOTHER = Verdict(BARE_HINT.gain_db, BARE.sigmas)
 """What one guide more has to gain beside those that are found: what says that there are any need not say it
 once more. Of seventeen random scenes none gained more than 3.2 sigmas by one too many."""
 
+DOUBT = Verdict(0.0, 1.0)
+"""What guides have to gain, and their shadows alone, for a closer look at where they are."""
+
 UNSHADED = Verdict(0.5, MIN_SIGMAS)
 """What guides beside bounced light have to gain where their shadows do not show: on two random scenes with
 light at the lens they had gained 0.24 and 0.29 dB, on two with guides 0.9 and 8."""

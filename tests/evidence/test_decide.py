@@ -300,7 +300,7 @@ def test_guides_in_doubt_are_judged_where_all_pixels_say_that_they_are(example, 
 
     monkeypatch.setattr(Probe, "compare", compared)
     monkeypatch.setattr("endotwin.evidence.guide_search.polished", polished)
-    monkeypatch.setattr(Ground, "unshadowed", lambda ground, model: (model, Verdict(0.1, by_shadows[0])))
+    monkeypatch.setattr(ground, "unshadowed", lambda model: (model, Verdict(0.1, by_shadows[0])))
     beside = ground.probe.fit(Hypothesis(others or AT_LENS, shadows=bool(others)))
     found = ground.probe.fit(Hypothesis(rough, shadows=True))
     better, model = judged(ground, beside, found)
