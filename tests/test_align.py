@@ -239,7 +239,7 @@ def test_a_hand_eye_error_is_found_and_held_out_photos_gain(fused, tmp_path):
     assert endotwin.evaluate(aligned).psnr_covered > plain.psnr_covered + 2
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_calibration_that_is_not_the_photos_is_put_right(fused, tmp_path, capsys):
     twin = fused()
     true_poses = registered_wrongly(twin, tmp_path / "spoilt", np.zeros(6), np.array([0.01, 0.005, 0.0]))
@@ -260,7 +260,7 @@ def test_photos_that_lie_on_the_surface_stay(fused):
     assert aligned.registration is None
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_depth_maps_that_moved_with_their_photos_find_back_to_each_other(example, tmp_path):
     sequence = endotwin.open_sequence(example)
     true = sequence.T_world_camera

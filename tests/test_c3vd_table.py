@@ -21,7 +21,7 @@ def table(root: Path, work: Path, *options: str) -> tuple[list[dict], str]:
         return list(csv.DictReader(opened)), done.stdout
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_table_has_every_sequence_the_published_rows_and_goes_on_where_it_was(tmp_path):
     root, work = tmp_path / "download", tmp_path / "work"
     tube_sequence.write(root / "registered" / "cecum_t1_a", 9, 96, 72)

@@ -250,6 +250,7 @@ def test_larger_sound_sequences_pass(data_root, sequence):
     assert named(data_root / sequence) == set()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("name", "sequence"), list(zip(OF_LENS, ["colon_fisheye", "colon_gi", "colon_fisheye"], strict=True))
 )

@@ -44,7 +44,7 @@ def test_a_fit_finds_what_a_scene_has_and_nothing_else(find, seed: int, effects:
     assert twin.response.gamma == pytest.approx(made["gamma"], rel=0.04)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_strength_of_a_bounce_off_pale_tissue_is_found(find) -> None:
     """The 98th percentile of its red is 0.85, not far below a furnace."""
     twin, made = find(237, {"interreflection"})
@@ -54,7 +54,7 @@ def test_the_strength_of_a_bounce_off_pale_tissue_is_found(find) -> None:
     assert endotwin.evaluate(twin).psnr_covered > 38
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_response_that_no_display_has_is_found_where_light_bounces(find) -> None:
     """What the model errs by says how far photos are believed, and it is little here."""
     twin, made = find(177, {"interreflection"})
@@ -62,7 +62,7 @@ def test_a_response_that_no_display_has_is_found_where_light_bounces(find) -> No
     assert twin.response.gamma == pytest.approx(made["gamma"], rel=0.04)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_haze_brighter_than_water_does_not_ruin_a_bounce(find, monkeypatch) -> None:
     """Whatever the highlights say: it passes for the tissue's own lobe, and sends on what falls on it."""
     said = Decision("on", "the highlights say so", 1.1)
@@ -74,7 +74,7 @@ def test_a_haze_brighter_than_water_does_not_ruin_a_bounce(find, monkeypatch) ->
     assert endotwin.evaluate(twin).psnr_covered > 37.5
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_false_tone_curve_is_taken_back_where_hues_ask_for_none_beside_it(find, monkeypatch) -> None:
     said = Decision("on", "the hues say so", 1.1)
     monkeypatch.setattr(light_stage, "judged_tone", lambda hues, wanted: (Tone(0.4), said))

@@ -68,7 +68,7 @@ def test_every_page_can_be_reached_from_the_readme(page):
     assert f"docs/{page.name}" in (ROOT / "README.md").read_text(encoding="utf-8")
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_session_of_the_python_page_runs_as_it_stands(tmp_path, monkeypatch):
     monkeypatch.chdir(ROOT)
     text = (ROOT / "docs" / "python.md").read_text(encoding="utf-8").replace("OUT/", f"{tmp_path}/")

@@ -89,6 +89,7 @@ def test_the_example_predicts_photos_that_it_never_saw(fitted):
     assert endotwin.evaluate(fitted).psnr_covered > 33
 
 
+@pytest.mark.long
 def test_a_tone_curve_over_the_example_is_found_and_leaves_the_response(fused, example, tmp_path):
     """Beside the light alone γ would be a twelfth too large."""
     toned, curve = tmp_path / "toned", Tone(0.3)
@@ -103,6 +104,7 @@ def test_a_tone_curve_over_the_example_is_found_and_leaves_the_response(fused, e
     assert twin.response.gamma == pytest.approx(made(example)["gamma"], rel=0.03)
 
 
+@pytest.mark.long
 def test_interreflection_that_no_photo_shows_is_fitted_away(fitted):
     forced = fit(fitted, effects={"interreflection": "on"})
     assert forced.decisions["interreflection"].state == "on"

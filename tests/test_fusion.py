@@ -325,6 +325,7 @@ def mean_distance_mm(surface, truth: Path) -> float:
     return float(scene.compute_distance(o3c.Tensor(world_mm(surface).astype(np.float32))).numpy().mean())
 
 
+@pytest.mark.long
 def test_colon_fisheye_fuses_within_a_twentieth_of_a_millimetre(data_root):
     sequence = open_sequence(data_root / "colon_fisheye")
     surface = fuse(sequence, voxel_mm=0.4, frames=range(0, len(sequence), 3))

@@ -132,6 +132,7 @@ def test_two_workers_give_the_bytes_of_one_and_die_with_the_run(twin, whole, tmp
     assert contents(out) == whole
 
 
+@pytest.mark.long
 def test_a_dask_cluster_of_two_workers_gives_the_same_bytes(twin, whole, tmp_path):
     distributed = pytest.importorskip("distributed")
     with distributed.LocalCluster(2, threads_per_worker=1, dashboard_address=None) as cluster:

@@ -35,7 +35,7 @@ def test_no_module_imports_what_windows_lacks_unless_it_is_ready_for_that():
                     assert not POSIX_MODULES & names, file
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_sequence_becomes_a_twin_and_a_dataset_without_posix(tmp_path):
     tube = tube_sequence.write(tmp_path / "tube", 6, 48, 36)
     (tmp_path / ".endotwin-left").mkdir()

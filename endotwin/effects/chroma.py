@@ -12,6 +12,7 @@ from endotwin.effects.codec import Codec
 from endotwin.effects.effect import Effect
 from endotwin.effects.luma import LUMA
 from endotwin.sequence import Sequence
+from endotwin.sequence.images import unclipped
 
 TO_RED, TO_BLUE = 1.402, 1.772
 """By which Cr and Cb are multiplied to be what red and blue have more than luminance (ITU-R BT.601)."""
@@ -88,7 +89,7 @@ def _details(photo: np.ndarray, lit: np.ndarray) -> np.ndarray:
     [3, 3]: broad detail; the finest, which colours between which is interpolated lack; and that within 2×2
     pixels, which repeated ones lack. Rounding's is ROUNDING in each.
     """
-    usable = lit & (photo.min(axis=2) > 0) & (photo.max(axis=2) < 255)
+    usable = lit & unclipped(photo)
     image = photo @ YCBCR.T
     spectra = (_of_runs(image, usable) + _of_runs(image.swapaxes(0, 1), usable.T)) / 2
     broad, finest = (spectra[:, each].mean(axis=1) for each in (BROAD, FINEST))

@@ -14,6 +14,7 @@ from endotwin.effects.effect import Effect
 from endotwin.effects.exposure import Shot
 from endotwin.effects.luma import LUMA
 from endotwin.sequence import Sequence
+from endotwin.sequence.images import unclipped
 
 FIELDS = (-0.25, 0.25)
 """When the even and the odd rows are exposed, in frame intervals from the labelled pose."""
@@ -87,7 +88,7 @@ def _details(photo: np.ndarray, lit: np.ndarray) -> tuple[np.ndarray, np.ndarray
     """Of the unclipped tiles of a photo uint8 [H, W, 3], and of the transposed photo: [N, 4] with what is
     ALTERNATING, what is SLOWER, the mean and the slope."""
     luma = photo @ LUMA
-    usable = lit & (photo.min(axis=2) > 0) & (photo.max(axis=2) < 255)
+    usable = lit & unclipped(photo)
     return _of_tiles(luma, usable), _of_tiles(luma.T, usable.T)
 
 
@@ -95,12 +96,13 @@ def _of_tiles(luma: np.ndarray, usable: np.ndarray) -> np.ndarray:
     """Of luminance [H, W], in its usable tiles."""
     down, across = luma.shape[0] // TILE_ROWS, luma.shape[1] // TILE_COLUMNS
 
-    def tiled(image: np.ndarray) -> np.ndarray:
+    def columns(image: np.ndarray) -> list[np.ndarray]:
+        """Those of all tiles, one after the other, each [down, TILE_ROWS, across]."""
         whole = image[: down * TILE_ROWS, : across * TILE_COLUMNS]
-        return whole.reshape(down, TILE_ROWS, across, TILE_COLUMNS).swapaxes(1, 2)
+        return [whole[:, k::TILE_COLUMNS].reshape(down, TILE_ROWS, across) for k in range(TILE_COLUMNS)]
 
-    rows = tiled(luma)[tiled(usable).all(axis=(2, 3))].mean(axis=2)
-    return rows @ BASIS
+    chosen = np.all(columns(usable), axis=0).all(axis=1)
+    return np.mean(columns(luma), axis=0).swapaxes(1, 2)[chosen] @ BASIS
 
 
 def _share(frames: tuple[np.ndarray, ...]) -> tuple[float, float, int]:

@@ -25,6 +25,10 @@ STRAY = 0.01
 CHANCE = 1e-6
 """Greatest probability that a photo which never was a JPEG picture is taken for one."""
 
+FAR = 12.0
+"""Step, in deviations of a decoder's rounding, from which on only the nearest multiple counts: half of it is
+six deviations."""
+
 DECIMALS = 3
 """Of coefficients that count as equal."""
 
@@ -57,7 +61,7 @@ def quality_in(photo: np.ndarray) -> float | None:
     likelihood = np.zeros(100)
     for values, steps in zip(coefficients.T[1:], _steps_by_quality().T[1:], strict=True):
         unlike, place = np.unique(steps, return_inverse=True)
-        likelihood += np.array([_log_likelihood_ratio(values, step) for step in unlike])[place]
+        likelihood += _log_likelihood_ratios(values, unlike)[place]
     best = 99 - likelihood[::-1].argmax()
     return 1.0 + best if likelihood[best] > np.log(len(likelihood) / CHANCE) else None
 
@@ -72,15 +76,23 @@ def _coefficients(photo: np.ndarray) -> np.ndarray:
     return found[np.unique(found[:, 1:].round(DECIMALS), axis=0, return_index=True)[1]]
 
 
-def _log_likelihood_ratio(values: np.ndarray, step: float) -> float:
-    """Of magnitudes [N] as multiples of ``step`` that were decoded, against any value between two multiples.
+def _log_likelihood_ratios(values: np.ndarray, steps: np.ndarray) -> np.ndarray:
+    """Of magnitudes [N] as multiples of each of the ascending ``steps`` [S] that were decoded, against any
+    value between two multiples, [S].
 
     Those below half a step are left out: small ones are many in every photo.
     """
-    values = values[values > step / 2]
-    apart = values - step * np.rint(values / step) + step * np.arange(-2, 3)[:, None]
-    density = np.exp(-0.5 * (apart / ROUNDED) ** 2).sum(axis=0) / (np.sqrt(2 * np.pi) * ROUNDED)
-    return float(np.log(STRAY + (1 - STRAY) * step * density).sum())
+    descending = np.sort(values)[::-1]
+    counts = np.searchsorted(-descending, -steps / 2)
+    step = np.repeat(steps, counts)
+    value = descending[np.arange(len(step)) - np.repeat(np.cumsum(counts) - counts, counts)]
+    apart, apiece = (value - step * np.rint(value / step)) / ROUNDED, step / ROUNDED
+    density = np.exp(-0.5 * apart**2)
+    close = counts[: np.searchsorted(steps, FAR * ROUNDED)].sum()
+    others = apart[:close] + apiece[:close] * np.array([[-2], [-1], [1], [2]])
+    density[:close] += np.exp(-0.5 * others**2).sum(axis=0)
+    ratio = np.log(STRAY + (1 - STRAY) / np.sqrt(2 * np.pi) * apiece * density)
+    return np.bincount(np.repeat(np.arange(len(steps)), counts), ratio, len(steps))
 
 
 @cache

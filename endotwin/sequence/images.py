@@ -39,6 +39,11 @@ def read_color(path: Path) -> np.ndarray:
     return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
 
 
+def unclipped(photo: np.ndarray) -> np.ndarray:
+    """Bool [H, W]: where no channel of a photo uint8 [H, W, 3] is 0 or 255."""
+    return cv2.inRange(photo, (1, 1, 1), (254, 254, 254)) > 0
+
+
 def write_png(path: Path, image: np.ndarray, overwrite: bool = False) -> None:
     """Write uint8 [H, W, 3], RGB, as the PNG file ``path``, whole or not at all; raises OutputError."""
     content = cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))[1].tobytes()

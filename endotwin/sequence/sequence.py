@@ -159,9 +159,10 @@ class Sequence:
 
         Raises SequenceError if the photos looked at are all black.
         """
-        brightest = np.zeros(self.image_size[::-1], np.uint8)
+        brightest = np.zeros((*self.image_size[::-1], 3), np.uint8)
         for index in self.spread(SURROUND_FRAMES):
-            np.maximum(brightest, self._native_color(index).max(axis=2), out=brightest)
+            np.maximum(brightest, self._native_color(index), out=brightest)
+        brightest = brightest.max(axis=2)
         if brightest.max() <= SURROUND_LEVEL:
             raise SequenceError(f"{self.path} has only black photos; check that they show the lumen")
         lit = (~dark_surround(brightest)).astype(np.float32)

@@ -108,7 +108,7 @@ def test_path_traced_colons_tell_an_automatic_gain_where_they_have_one(data_root
     assert (AutoGain.evidence(open_sequence(folder))[0] is not None) == told
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_it_is_the_same_with_two_workers_and_the_labels_hold(twin, tmp_path):
     one, two = tmp_path / "one", tmp_path / "two"
     rendered(twin, one), rendered(twin, two, workers=2)

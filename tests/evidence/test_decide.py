@@ -200,6 +200,7 @@ def test_vignetting_is_told_from_the_profile_of_a_light_at_the_lens_by_what_boun
     assert decided.effects["vignetting"].k2 == pytest.approx(-0.5, abs=0.1)
 
 
+@pytest.mark.long
 def test_guides_that_stand_far_out_for_how_near_the_wall_is_are_found(tmp_path):
     """4 to 5 mm beside the lens, where the wall is seen from 15 mm."""
     made = make(replace(Scene.draw(54, ["offset"]), frames=8), tmp_path / "scene")
@@ -209,6 +210,7 @@ def test_guides_that_stand_far_out_for_how_near_the_wall_is_are_found(tmp_path):
         assert np.linalg.norm(np.subtract(found, true_mm), axis=1).min() < 0.7
 
 
+@pytest.mark.long
 def test_guides_two_millimetres_from_the_lens_are_found_where_no_light_bounces(tmp_path):
     """A tenth of a decibel off the highlights, and three with them."""
     made = make(Scene.draw(400).having(frozenset(("offset", "shadows", "coat"))), tmp_path)
@@ -235,6 +237,7 @@ def test_guides_are_found_within_half_a_millimetre_with_their_shadows(lit_from_b
     np.testing.assert_allclose(sorted(decided.effects["offset"].guides_mm), GUIDES_MM, atol=0.5)
 
 
+@pytest.mark.long
 @needs_data
 def test_guides_are_found_from_near_them_as_from_nowhere(lit_from_beside):
     near_mm = tuple(map(tuple, np.add(GUIDES_MM, [[0.6, -0.4, 0.0], [-0.5, 0.5, -0.3]])))

@@ -13,13 +13,21 @@ from endotwin.selfcheck import GROUPS, Finding, run_checks
 
 pytestmark = pytest.mark.slow
 
-CHECKS = [(name, check) for name in GROUPS for check in import_module(f"endotwin.selfcheck.{name}").CHECKS]
+TWINS_BY_THE_DOZEN = ("motion", "depth", "seeds", "places", "photos")
+
+CHECKS = [
+    pytest.param(
+        check,
+        marks=[pytest.mark.long] if check.__name__ in TWINS_BY_THE_DOZEN else [],
+        id=f"{name}-{check.__name__}",
+    )
+    for name in GROUPS
+    for check in import_module(f"endotwin.selfcheck.{name}").CHECKS
+]
 
 
 @pytest.mark.filterwarnings("error::RuntimeWarning")  # as the command has it
-@pytest.mark.parametrize(
-    "check", [check for _, check in CHECKS], ids=[f"{n}-{c.__name__}" for n, c in CHECKS]
-)
+@pytest.mark.parametrize("check", CHECKS)
 def test_every_bound_is_kept(check):
     findings = list(check())
     assert findings

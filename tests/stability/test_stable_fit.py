@@ -61,6 +61,7 @@ def bits(twin: Twin) -> tuple:
     return tuple(maps[name].tobytes() for name in maps), twin.light, twin.response, twin.materials.f0
 
 
+@pytest.mark.long
 def test_few_pixels_drawn_with_other_seeds_agree_within_three_tenths_of_a_decibel(fused):
     """The bundled example at a quarter of its size; half of its pixels are looked at, an eighth for the
     light."""
@@ -237,6 +238,7 @@ main()
 """
 
 
+@pytest.mark.long
 def test_the_command_stopped_by_the_system_goes_on_to_the_same_twin(tube, tmp_path):
     tube.save(tmp_path / "twin")
     command = [sys.executable, "-c", SLOW_FIT, "fit", "twin", "--method", "endopbr", "--epochs", "10"]
