@@ -75,10 +75,9 @@ def test_a_haze_brighter_than_water_does_not_ruin_a_bounce(find, monkeypatch) ->
 
 
 @pytest.mark.long
-def test_a_false_tone_curve_is_taken_back_where_hues_ask_for_none_beside_it(find, monkeypatch) -> None:
+def test_a_false_tone_curve_is_taken_back_where_all_pixels_bend_it_to_none(find, monkeypatch) -> None:
     said = Decision("on", "the hues say so", 1.1)
     monkeypatch.setattr(light_stage, "judged_tone", lambda hues, wanted: (Tone(0.4), said))
-    monkeypatch.setattr(light_stage, "steadied", lambda tone, hues: Tone(0.05))
     twin, made = find(237, {"interreflection"})
     assert twin.decisions["tone"].state == "off" and said.reason in twin.decisions["tone"].reason
     assert "tone" not in twin.effects and "interreflection" in twin.effects

@@ -9,7 +9,7 @@ import torch
 from independent.gloss import Gloss
 
 from endotwin.effects.coat import Coat
-from endotwin.effects.tone import Tone
+from endotwin.effects.tone import Tone, bend
 from endotwin.fit.model import linearise
 from endotwin.light import forward, shading
 from endotwin.light.forward import Lit, Lobes
@@ -67,7 +67,7 @@ def test_the_derivatives_of_least_squares_are_those_of_automatic_differentiation
     """By base colour, roughness, coat and, at the displayed colour b^γ, by what all pixels share."""
     samples = test_model.SCENES[scene](test_model.made_samples(40, 17))
     material, shared = test_model.made_materials(40), replace(test_model.shared_of(scene), coat=coat)
-    shared = replace(shared, tone=tone)
+    shared = shared.under(tone)
     model = linearise(samples, material, shared)
     shown = material[:, :3] ** shared.gamma
 
@@ -87,7 +87,7 @@ def test_the_derivatives_of_least_squares_are_those_of_automatic_differentiation
             lit = replace(lit, irradiance=lit.irradiance * followed)
         x = forward.radiance(lit, (log_L0, n, q), color, roughness, lobes)
         untoned = shading.respond(x, vector[3])
-        return untoned if tone is None else tone.shown(untoned)
+        return untoned if tone is None else untoned + vector[shared.unscaled - 1] * bend(untoned)
 
     weight = torch.tensor(0.0 if coat is None else coat.weight, dtype=torch.float64)
     by_vector, by_roughness, by_weight = torch.autograd.functional.jacobian(

@@ -12,6 +12,7 @@ from endotwin.effects import Effects
 from endotwin.effects.coat import Coat
 from endotwin.effects.interreflection import Interreflection
 from endotwin.effects.specular import Specular
+from endotwin.effects.tone import Tone
 from endotwin.effects.vignetting import Vignetting
 from endotwin.fit.gauss_newton import FIRST_ERROR, PASSING, STANDARD_SPREAD, TEMPER, GaussNewton
 from endotwin.fit.model import Globals
@@ -109,14 +110,16 @@ def test_tissue_is_too_dark_by_what_it_reflects_not_by_its_scale():
         assert not too_dark(colored(factor, math.log(1.2 * DARKEST / factor)))
 
 
-def explained(gamma: float, bounces: bool, lens: Vignetting | None = None) -> tuple[GaussNewton, State]:
-    """A tube under a response of ``gamma``, behind a ``lens``, and photos of it that show just what is
-    predicted."""
+def explained(
+    gamma: float, bounces: bool, lens: Vignetting | None = None, tone: Tone | None = None
+) -> tuple[GaussNewton, State]:
+    """A tube under a response of ``gamma`` and a ``tone`` curve, behind a ``lens``, and photos of it that
+    show just what is predicted."""
     twin = tube_twin.fitted(tube_twin.seen(tube_twin.surface()))
     samples = tube_twin.photographed(twin, tube_twin.CAMERA, tube_twin.pose(0.5)[None])
     effects = Effects([Specular(), *([Interreflection(4.0)] * bounces), *([lens] if lens else [])])
     shared = Globals.of(twin.light, Response(gamma), twin.materials.f0, bounce=bounces)
-    state = replace(tube_twin.state_of(twin), shared=shared.behind(lens))
+    state = replace(tube_twin.state_of(twin), shared=shared.behind(lens).under(tone))
     solver = tube_twin.seen_by_the_fit(twin, samples, state, effects)
     shown = 255 * tube_twin.shown_to_the_fit(solver, state).clamp(0, 1) + 0.5
     solver.relight(replace(solver.samples, color=shown.to(torch.uint8)))
@@ -176,3 +179,15 @@ def test_where_light_bounces_a_step_finds_what_the_lens_dims_beside_light_and_re
     solver.held = ("k2",)
     state = solver.step(replace(true, shared=true.shared.behind(Vignetting(-0.2)))).state
     assert state.shared.k2 == pytest.approx(-0.2)
+
+
+def test_where_light_bounces_steps_find_the_contrast_of_a_curve_beside_light_response_and_materials():
+    solver, true = explained(1 / 2.2, bounces=True, tone=Tone(0.4))
+    begun = replace(true, shared=true.shared.under(Tone(0.2)))
+    state = begun
+    for _ in range(4):
+        state = solver.step(state).state
+    assert state.shared.tone.contrast == pytest.approx(0.4, abs=0.03)
+    assert state.shared.gamma == pytest.approx(1 / 2.2, rel=0.01)
+    solver.held = ("contrast",)
+    assert solver.step(begun).state.shared.tone.contrast == pytest.approx(0.2)

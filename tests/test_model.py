@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from endotwin.effects.coat import Coat
+from endotwin.effects.tone import Tone
 from endotwin.effects.vignetting import Vignetting
 from endotwin.fit.linear import conjugate_gradients, joint_minimum
 from endotwin.fit.mesh_pattern import MeshPattern
@@ -160,13 +161,16 @@ SCENES = {
     "in a tube whose light follows its colours": lambda samples: following(in_a_tube(samples)),
     "behind a lens": behind_a_lens,
     "beside the lens in a tube behind it": lambda samples: behind_a_lens(in_a_tube(beside_the_lens(samples))),
+    "toned": lambda samples: samples,
+    "in a tube behind a lens, toned": lambda samples: behind_a_lens(in_a_tube(samples)),
 }
 BOUNCE_SHARED = Globals(torch.cat([SHARED.vector, torch.tensor([0.1], dtype=torch.float64)]))
 
 
 def shared_of(scene: str) -> Globals:
     shared = BOUNCE_SHARED if "tube" in scene else SHARED
-    return shared.behind(Vignetting(-0.4)) if "behind" in scene else shared
+    shared = shared.behind(Vignetting(-0.4)) if "behind" in scene else shared
+    return shared.under(Tone(0.4)) if "toned" in scene else shared
 
 
 @pytest.mark.parametrize("scene", SCENES)
@@ -229,6 +233,23 @@ def test_a_lens_is_one_parameter_more_before_the_albedos_scale_and_can_be_taken_
         assert ("ln albedo scale" in names) == bare.bounces
         assert torch.equal(behind.behind(None).vector, bare.vector) and bare.k2 == 0
         assert behind.without_scale().k2 == behind.k2 and not behind.without_scale().bounces
+
+
+def test_a_curve_is_one_parameter_more_after_the_lens_and_can_be_taken_off_again():
+    for bare in (
+        SHARED,
+        BOUNCE_SHARED,
+        SHARED.behind(Vignetting(-0.4)),
+        BOUNCE_SHARED.behind(Vignetting(-0.4)),
+    ):
+        toned = bare.under(Tone(0.4))
+        assert toned.tone == Tone(0.4) and toned.under(Tone(0.2)).tone == Tone(0.2) and bare.tone is None
+        assert (toned.bounces, toned.log_scale, toned.light) == (bare.bounces, bare.log_scale, bare.light)
+        assert toned.k2 == pytest.approx(bare.k2) and "contrast" in [
+            EVERY_GLOBAL[place] for place in toned.places
+        ]
+        assert torch.allclose(toned.under(None).vector, bare.vector)
+        assert toned.without_scale().tone == toned.tone and not toned.without_scale().bounces
 
 
 def test_globals_give_back_the_light_and_response_they_were_made_of():

@@ -61,7 +61,7 @@ def seen_by_the_fit(tube: Twin, effects: Effects) -> tuple[GaussNewton, State]:
     """The tube's pixels under ``effects`` as the fit has them, and what it would fit."""
     samples, state = tube_twin.photographed(tube, tube.camera, POSES), tube_twin.state_of(tube)
     shared = Globals.of(tube.light, tube.response, tube.materials.f0, bounce=bool(effects.bounce))
-    shared = replace(shared, coat=effects.get("coat"), tone=effects.get("tone"))
+    shared = replace(shared, coat=effects.get("coat")).under(effects.get("tone"))
     state = replace(state, shared=shared.behind(effects.get("vignetting")))
     return tube_twin.seen_by_the_fit(tube, samples, state, effects), state
 

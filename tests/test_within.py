@@ -107,7 +107,7 @@ def coloured(within: Within, material: torch.Tensor, shared: Globals) -> torch.T
     shown = within.samples.color.double() / 255
     if shared.tone is not None:
         shown = torch.from_numpy(shared.tone.undone(shown.numpy()))
-    brighter = torch.log(shown) - torch.log(predict(within.samples, material, replace(shared, tone=None)))
+    brighter = torch.log(shown) - torch.log(predict(within.samples, material, shared.under(None)))
     dull = ((within.samples.sin2 > DIFFUSE_SIN2)[:, None] * (shown < 1)).double()
     mean = torch.zeros(VERTICES, 3, dtype=torch.float64), torch.from_numpy(within.vertex)
     brighter = mean[0].index_add(0, mean[1], dull * brighter) / mean[0].index_add(0, mean[1], dull)
@@ -117,16 +117,16 @@ def coloured(within: Within, material: torch.Tensor, shared: Globals) -> torch.T
 
 @pytest.mark.parametrize("contrast", [0.2, 0.4])
 def test_a_tone_curve_is_found_with_light_and_response_that_begin_elsewhere(contrast):
-    within, material = photographed(replace(TRUE, tone=Tone(contrast)))
+    within, material = photographed(TRUE.under(Tone(contrast)))
     shared = Globals.of(Light(120.0, 2.2, 2.0), Response(0.5), f0=0.045)
     material = coloured(within, material, shared)
     tone, decision = judged_tone(within.hues(material, shared, NOISE), "auto")
     assert decision.state == "on" and tone.contrast == pytest.approx(contrast, abs=0.05)
-    shared = replace(shared, tone=tone)
+    shared = shared.under(tone)
     for _ in range(8):
         material = coloured(within, material, shared)
         shared = within.renewed(material, shared, (), NOISE).shared
-        shared = replace(shared, tone=steadied(shared.tone, within.hues(material, shared, NOISE)))
+        shared = shared.under(steadied(shared.tone, within.hues(material, shared, NOISE)))
     assert shared.tone.contrast == pytest.approx(contrast, abs=0.03)
     assert told(shared)[:3] == pytest.approx(told(TRUE)[:3], rel=0.03)
 

@@ -60,8 +60,8 @@ def judged(without: Callable[[Tone], Hues], wanted: str) -> tuple[Tone | None, D
 
     Where light bounces they have to call for one beside a bounce of any strength, too: what the bounce
     lacks turns hues as well, most of all where its strength is found too far off. Beside the bounce that was
-    found without a curve, and has made up for one, they ask for too little; beside any, for too much: the
-    curve is taken to be halfway, and is none where even these ask for none.
+    found without a curve, and has made up for one, they ask for too little; beside any, for too much: a fit
+    of all may begin halfway, and there is none where even these ask for none.
 
     Args:
         without: the hues, by the curve that is taken off.

@@ -156,7 +156,7 @@ class LightStage:
         self._solver, operator = solver_of(samples, surface, self._unit_mm, CELL_MM, **options)
         set_up = pace.stopwatch.total
         if self._goes_on:
-            shared = replace(before.state.shared, tone=tone).behind(relighting.effects.get("vignetting"))
+            shared = before.state.shared.under(tone).behind(relighting.effects.get("vignetting"))
             self._state = replace(before.state, operator=operator, shared=shared)
         else:
             self._state = started(operator, start, relighting, self._solver.pattern.told, tone)
@@ -203,12 +203,12 @@ class LightStage:
         number, near, best = 0, self._goes_on and self._pace.hurried, None
         while number < BOUNCE_STEPS and not self._late:
             if near and (toned := self._newly_toned()) is not None:
-                return toned
+                return toned if self._pace.hurried else self._bent(toned)
             if near and self._took_tone_back():
-                number, near = 0, False
+                number, near, best = 0, False, None
             shared = self._judged(near)
             holding = number < HOLD_STEPS and not self._goes_on
-            held = ("n", "gamma", "k2") if holding else self._undetermined
+            held = ("n", "gamma", "k2", "contrast") if holding else self._undetermined
             self._solver.held = (*held, *BOUNCE_HELD)
             on_trial = self._bare is not None
             gain = self._step_coated(shared) if shared.coat else self._step(joint=True)
@@ -234,6 +234,15 @@ class LightStage:
         if best is not None:
             self._take_best(self._better(best))
         return None
+
+    def _bent(self, toned: Toned) -> Toned:
+        """A tone curve that hues tell of, as all pixels bend it in steps with light and materials until these
+        are near: what hues say beside what was found without it, that has made up for in part."""
+        self._state = replace(self._state, shared=self._state.shared.under(toned[0]))
+        for _ in range(BOUNCE_STEPS):
+            if self._late or self._changed_by_less(self._step(joint=True), NEAR):
+                break
+        return self._state.shared.tone, toned[1]
 
     def _changed_by_less(self, gain: float, share: float) -> bool:
         """Whether a step by which the cost fell by ``gain`` changed it by less than that share of it."""
@@ -314,23 +323,19 @@ class LightStage:
         return self._state.shared
 
     def _took_tone_back(self) -> bool:
-        """Bend the tone curve, if there is one, to where hues are steadiest, unless all pixels are plainly
-        worse so: what the bounce lacks turns hues as well. Where they ask for none beside what was found
-        without it, it is taken back; whether it was."""
-        before, noise = self._state, self._noise
-        if before.shared.tone is None:
+        """Bend the tone curve, if there is one, to where hues are steadiest, unless all pixels have bent it:
+        where light bounces. Where it is next to none it is taken back; whether it was."""
+        shared = self._state.shared
+        if not shared.toned:
             return False
-        tone = steadied(before.shared.tone, self._hues())
-        if tone.contrast < LEAST_CONTRAST and self._wanted["tone"] != "on":
+        tone = shared.tone if self._relighting.bounces else steadied(shared.tone, self._hues())
+        taken = tone.contrast < LEAST_CONTRAST and self._wanted["tone"] != "on"
+        if taken:
             said = self._decisions["tone"]
-            reason = f"{said.reason}, but beside what was found without it hues ask for none"
+            reason = f"{said.reason}, but beside what was found without it none is asked for"
             self._decisions["tone"] = replace(said, state="off", reason=reason)
-            self._state = replace(before, shared=replace(before.shared, tone=None))
-            return True
-        self._state = replace(before, shared=replace(before.shared, tone=tone))
-        if self._solver.cost(self._state, noise) > WORSE * self._solver.cost(before, noise):
-            self._state = before
-        return False
+        self._state = replace(self._state, shared=shared.under(None if taken else tone))
+        return taken
 
     def _hues(self) -> Callable[[Tone], Hues]:
         within, material = self._within()

@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.nn.functional import embedding_bag
 
 from endotwin.effects.coat import Coat
-from endotwin.effects.tone import Tone
+from endotwin.effects.tone import Tone, bend
 from endotwin.effects.vignetting import Vignetting
 from endotwin.light import forward, shading
 from endotwin.light.forward import Lit, Lobes
@@ -25,9 +25,9 @@ GLOBALS = ("gamma·ln L0", "gamma·n", "gamma·q", "gamma", "ln f0")
 
 GAMMA, F0 = (GLOBALS.index(name) for name in ("gamma", "ln f0"))
 
-EVERY_GLOBAL = (*GLOBALS, "gamma·k2", "ln albedo scale")
-"""Behind a lens that vignettes there is one more, since light of another n passes for most of that; and with
-interreflection another: it tells how bright the tissue is beside the light."""
+EVERY_GLOBAL = (*GLOBALS, "gamma·k2", "contrast", "ln albedo scale")
+"""Behind a lens that vignettes there is one more, since light of another n passes for most of that; under a
+tone curve another; and with interreflection one that tells how bright the tissue is beside the light."""
 
 
 @dataclass(frozen=True)
@@ -36,16 +36,17 @@ class Globals:
     for.
 
     Without ``specular`` there is no specular lobe, and ln f0 stays where it is. A ``coat`` adds a lobe of its
-    own; a ``tone`` bends what x^γ displays; a lens that ``vignettes`` adds a parameter. ``tissue`` [3] is the
-    mean of ln of the base colours that bounced light follows; None: what it was when that was found.
+    own; a lens that ``vignettes`` adds a parameter, and so does a tone curve, which what x^γ displays is
+    ``toned`` by. ``tissue`` [3] is the mean of ln of the base colours that bounced light follows; None: what
+    it was when that was found.
     """
 
     vector: Tensor
     specular: bool = True
     coat: Coat | None = None
-    tone: Tone | None = None
     tissue: Tensor | None = None
     vignettes: bool = False
+    toned: bool = False
 
     @classmethod
     def of(
@@ -57,9 +58,17 @@ class Globals:
 
     def behind(self, lens: Vignetting | None) -> Globals:
         """The same behind a ``lens`` that vignettes, whose k2 is found; None: that does not vignette."""
-        rest = [torch.tensor([self.gamma * lens.k2], dtype=torch.float64)] if lens else []
+        return self._beside(lens, self.tone)
+
+    def under(self, tone: Tone | None) -> Globals:
+        """The same under a ``tone`` curve, whose contrast is found; None: under none."""
+        return self._beside(Vignetting(k2=self.k2) if self.vignettes else None, tone)
+
+    def _beside(self, lens: Vignetting | None, tone: Tone | None) -> Globals:
+        more = [*([self.gamma * lens.k2] if lens else []), *([tone.contrast] if tone else [])]
         bare, scale = self.vector[: len(GLOBALS)], self.vector[self.unscaled :]
-        return replace(self, vector=torch.cat([bare, *rest, scale]), vignettes=lens is not None)
+        vector = torch.cat([bare, torch.tensor(more, dtype=torch.float64), scale])
+        return replace(self, vector=vector, vignettes=lens is not None, toned=tone is not None)
 
     @property
     def log_light(self) -> tuple[float, float, float]:
@@ -90,7 +99,7 @@ class Globals:
     @property
     def unscaled(self) -> int:
         """How many parameters come before the albedo's scale."""
-        return len(GLOBALS) + self.vignettes
+        return len(GLOBALS) + self.vignettes + self.toned
 
     @property
     def bounces(self) -> bool:
@@ -103,9 +112,14 @@ class Globals:
         return float(self.vector[len(GLOBALS)]) / self.gamma if self.vignettes else 0.0
 
     @property
+    def tone(self) -> Tone | None:
+        """The curve over the photos; None without one."""
+        return Tone(float(self.vector[self.unscaled - 1])) if self.toned else None
+
+    @property
     def places(self) -> list[int]:
         """Of the parameters in EVERY_GLOBAL, [G]."""
-        there = [True] * len(GLOBALS) + [self.vignettes, self.bounces]
+        there = [True] * len(GLOBALS) + [self.vignettes, self.toned, self.bounces]
         return [place for place, is_there in enumerate(there) if is_there]
 
     @property
@@ -126,21 +140,22 @@ def columns_of(shared: Globals, bordered: bool) -> np.ndarray:
 
 
 def free_directions(shared: Globals, held: tuple[str, ...]) -> np.ndarray:
-    """Steps of the shared parameters that keep those named in ``held`` (L0, n, q, gamma, f0, k2, albedo
-    scale, or the level γ·ln L0, with which displayed base colours stay): a basis [G, K].
+    """Steps of the shared parameters that keep those named in ``held`` (L0, n, q, gamma, f0, k2, contrast,
+    albedo scale, or the level γ·ln L0, with which displayed base colours stay): a basis [G, K].
 
     The light is fitted as γ·ln L0, γ·n and γ·q: γn − n·γ = 0 keeps n while γ moves.
     """
     log_L0, n, q = shared.log_light
     kept = {
-        "L0": [1, 0, 0, -log_L0, 0, 0, 0],
-        "level": [1, 0, 0, 0, 0, 0, 0],
-        "n": [0, 1, 0, -n, 0, 0, 0],
-        "q": [0, 0, 1, -q, 0, 0, 0],
-        "gamma": [0, 0, 0, 1, 0, 0, 0],
-        "f0": [0, 0, 0, 0, 1, 0, 0],
-        "k2": [0, 0, 0, -shared.k2, 0, 1, 0],
-        "albedo scale": [0, 0, 0, 0, 0, 0, 1],
+        "L0": [1, 0, 0, -log_L0, 0, 0, 0, 0],
+        "level": [1, 0, 0, 0, 0, 0, 0, 0],
+        "n": [0, 1, 0, -n, 0, 0, 0, 0],
+        "q": [0, 0, 1, -q, 0, 0, 0, 0],
+        "gamma": [0, 0, 0, 1, 0, 0, 0, 0],
+        "f0": [0, 0, 0, 0, 1, 0, 0, 0],
+        "k2": [0, 0, 0, -shared.k2, 0, 1, 0, 0],
+        "contrast": [0, 0, 0, 0, 0, 0, 1, 0],
+        "albedo scale": [0, 0, 0, 0, 0, 0, 0, 1],
     }
     if not held:
         return np.eye(len(shared.vector))
@@ -231,16 +246,18 @@ class Linearised:
         plain, scale = self.by_globals[..., : count * bordered], self.by_globals[..., count:]
         return torch.cat([plain, torch.diag_embed(scale[..., 0])], dim=2) if scale.shape[2] else plain
 
-    def toned(self, tone: Tone | None) -> Linearised:
-        """The same as the ``tone`` curve displays it."""
-        if tone is None:
+    def under(self, shared: Globals) -> Linearised:
+        """The same as the tone curve of the ``shared`` parameters displays it, and by its contrast."""
+        if not shared.toned:
             return self
-        steep = tone.slope(self.predicted)
+        steep, place = shared.tone.slope(self.predicted), shared.unscaled - 1
+        by_globals = steep[..., None] * self.by_globals
+        parts = by_globals[..., :place], bend(self.predicted)[..., None], by_globals[..., place:]
         return Linearised(
-            predicted=tone.shown(self.predicted),
+            predicted=shared.tone.shown(self.predicted),
             by_color=steep * self.by_color,
             by_roughness=steep * self.by_roughness,
-            by_globals=steep[..., None] * self.by_globals,
+            by_globals=torch.cat(parts, dim=-1),
             by_coat=None if self.by_coat is None else steep * self.by_coat,
         )
 
@@ -302,4 +319,4 @@ def linearise(samples: Samples, material: Tensor, shared: Globals) -> Linearised
         by_roughness=slope * (color_slope[:, None] * base_color + shine_slope[:, None]),
         by_globals=torch.stack(by_globals, dim=-1),
         by_coat=None if coat is None else slope * coat,
-    ).toned(shared.tone)
+    ).under(shared)

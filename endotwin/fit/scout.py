@@ -60,7 +60,7 @@ def likeliest_n(
     ``samples`` unexplained, as they look through the ``tone`` curve."""
     few, unit = _few_of(samples, surface), unit_mm(surface)
     solver, operator = solver_of(few, surface, unit, CELL_MM)
-    solver.held = ("n", "gamma", "k2", *held)
+    solver.held = ("n", "gamma", "k2", "contrast", *held)
 
     def gone_on(path: _Path, joint: bool) -> _Path:
         """A path after STEPS more, the first of the materials alone unless it is ``joint``."""

@@ -23,7 +23,7 @@ at the clamp, beyond which no step finds a lower cost."""
 
 GLOBAL_RANGE = (
     *((-20.0, 20.0), (0.0, 10.0), (0.0, 4.0), (0.15, 1.5), (-6.0, -0.7)),
-    *((-0.75, 0.0), (-4.0, 4.0)),
+    *((-0.75, 0.0), (0.0, 0.9), (-4.0, 4.0)),
 )
 """Bounds of the shared parameters, in the order of EVERY_GLOBAL: no lens passes more light at its rim."""
 

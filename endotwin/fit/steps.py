@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 
 import numpy as np
 import torch
@@ -57,7 +56,7 @@ def started(
     shown = torch.from_numpy(start.base_color) ** start.response.gamma
     mean = torch.cat([shown.median(dim=0).values, torch.tensor([roughness_to_raw(ROUGHNESS_TISSUE)])])
     options = {"specular": "specular" in relighting.effects, "bounce": relighting.bounces}
-    shared = replace(Globals.of(start.light, start.response, F0_DIELECTRIC, **options), tone=tone)
+    shared = Globals.of(start.light, start.response, F0_DIELECTRIC, **options).under(tone)
     shared = shared.behind(relighting.effects.get("vignetting"))
     state = State(operator, mean, torch.zeros(operator.forward_csr.shape[1], 4), shared, told)
     return rescaled(state, math.log(PALE / brightest(state))) if relighting.bounces else state

@@ -160,7 +160,7 @@ class Within:
                 values.
         """
         diffuse = self.samples.sin2 > DIFFUSE_SIN2
-        found = self._step(material, shared, (*held, "level", "f0", "k2"), diffuse, noise, varied)
+        found = self._step(material, shared, (*held, "level", "f0", "k2", "contrast"), diffuse, noise, varied)
         if not shared.specular:
             return found
         shone = self.shone(material, found.shared, noise)
@@ -172,7 +172,7 @@ class Within:
         Without a coat roughness is left to the materials: diffuse light depends on it as well, and it would
         take up what other faults of the model leave.
         """
-        kept = ("level", "n", "q", "gamma", "k2", "albedo scale")
+        kept = ("level", "n", "q", "gamma", "k2", "contrast", "albedo scale")
         return self._step(material, shared, kept, torch.ones(len(self.samples), dtype=torch.bool), noise)
 
     def highlights(self, material: Tensor, shared: Globals, noise: float) -> Callable[[Coat], Highlights]:
@@ -201,7 +201,7 @@ class Within:
         diffuse = self.samples.sin2 > DIFFUSE_SIN2
         diffuse &= torch.from_numpy(self.vertex % max(1, int(diffuse.sum()) // HUE_PIXELS) == 0)
         rows = self._coloured(diffuse)
-        model = linearise(self.samples[rows], material[rows], replace(shared, tone=None))
+        model = linearise(self.samples[rows], material[rows], shared.under(None))
         bright = ((model.predicted > DARKEST) & (model.predicted < 1)).all(dim=1)
         rows, predicted = rows[bright], model.predicted[bright].double()
         shown = self.samples.color[rows].double().numpy() / 255
