@@ -11,6 +11,7 @@ import endotwin
 from endotwin.cameras import Fisheye, Pinhole
 from endotwin.errors import OptionError
 from endotwin.sequence.readers import open_sequence
+from endotwin.twin import Registration
 
 FISHEYE = {"model": "fisheye", "width": 320, "height": 240, "fx": 150, "fy": 150, "cx": 161, "cy": 118}
 
@@ -59,6 +60,32 @@ def test_a_twin_of_undistorted_frames_opens_them_so_again(distorted, tmp_path):
     np.testing.assert_allclose(half.matrix, halved.matrix, atol=0.3)
     assert (half.width, half.height) == (80, 60)
     assert twin.at_scale(0.5).camera == half and twin.at_scale(1.0).camera == twin.camera
+
+
+def test_corrected_intrinsics_move_the_colour_that_a_ray_sees_and_leave_the_photo(distorted):
+    ray, none = np.array([[0.1, -0.2, 1.0]]), ((0.0,) * 6,) * 3
+
+    def seen(sequence, photo):
+        at = sequence.camera.project(ray).astype(np.float32)
+        return cv2.remap(photo, at[:, :1], at[:, 1:], cv2.INTER_LINEAR)[0, 0]
+
+    def moved(sequence):
+        """The photos before and after, and by how much the ray's colour changed."""
+        corrected = Registration(none, intrinsics=(0.05, 0.03, -0.02)).applied(sequence)
+        before, after = (each.color(1).astype(np.float32) for each in (sequence, corrected))
+        return before, after, seen(corrected, after) - seen(sequence, before)
+
+    *_, on_native = moved(open_sequence(distorted, scale=0.5))
+    before, after, on_pinhole = moved(open_sequence(distorted, undistort=(160, 120)))
+    np.testing.assert_array_equal(after, before)
+    assert np.abs(on_native).max() > 10
+    np.testing.assert_allclose(on_pinhole, on_native, atol=3)
+
+
+def test_undistorted_frames_are_described_in_one_line_as_others_are(distorted):
+    assert repr(open_sequence(distorted, undistort=(160, 120))).endswith(
+        "tube: 3 frames, 160×120 pinhole, c3vd)"
+    )
 
 
 def test_a_size_that_enlarges_or_a_scale_beside_it_is_refused(distorted):

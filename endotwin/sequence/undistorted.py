@@ -16,11 +16,15 @@ from endotwin.errors import OptionError
 from endotwin.sequence.sequence import Sequence
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Undistorted(Sequence):
-    """Frames of ``native`` resampled through the pinhole ``camera``, which has the same centre and axes."""
+    """Frames of ``native`` resampled through ``pinhole``, which has the same centre and axes.
+
+    ``camera`` is that pinhole too, until an alignment corrects it: the frames stay as they were resampled.
+    """
 
     native: Sequence | None = None
+    pinhole: Pinhole | None = None
 
     @classmethod
     def of(cls, sequence: Sequence, width: int, height: int) -> Undistorted:
@@ -38,7 +42,8 @@ class Undistorted(Sequence):
         focal = float(1 / np.linalg.norm(across[1] - across[0]))
         pinhole = Pinhole(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
         kept = {field.name: getattr(sequence, field.name) for field in fields(sequence)}
-        return cls(**{**kept, "camera": pinhole}, native=replace(sequence, camera=camera, scale=scale))
+        native = replace(sequence, camera=camera, scale=scale)
+        return cls(**{**kept, "camera": pinhole}, native=native, pinhole=pinhole)
 
     def color(self, index: int) -> np.ndarray:
         """Photo ``index``, uint8 [H, W, 3], RGB; black where the native image ends."""
@@ -56,7 +61,7 @@ class Undistorted(Sequence):
     @cached_property
     def _at(self) -> tuple[np.ndarray, np.ndarray]:
         """Native columns and rows, float32 [H, W] each, that the pixels see."""
-        rays = self.camera.pixel_directions.astype(np.float64)
+        rays = self.pinhole.pixel_directions.astype(np.float64)
         uv = self.native.camera.project(rays.reshape(-1, 3)).reshape(rays.shape[0], rays.shape[1], 2)
         u, v = np.nan_to_num(uv, nan=-9).astype(np.float32).transpose(2, 0, 1)
         return np.ascontiguousarray(u), np.ascontiguousarray(v)
