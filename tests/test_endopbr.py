@@ -78,6 +78,24 @@ def test_pixels_without_a_depth_gradient_are_left_out(inside_sphere):
     assert len(inside_sphere[1]["cos"]) == 160 * 120 - 5
 
 
+def test_photos_aligned_apart_from_their_depth_have_points_and_normals_of_the_surface(tube):
+    """As far from the cylinder that was photographed as the surface is, wherever its photos were moved."""
+    twists = np.c_[np.zeros((10, 3)), np.random.default_rng(0).normal(0, 1.0, (10, 3))]
+    aligned = replace(tube, registration=Registration(tuple(map(tuple, twists))))
+    sequence = aligned.sequence()
+    pixels = endopbr.Photos(aligned, sequence, torch.device("cpu"))[1]
+    world = pixels["points_mm"].numpy() + tube.surface.origin_mm
+    to_wall_mm = tube_sequence.RADIUS_MM - np.hypot(world[:, 0], world[:, 1])
+    to_cap_mm = tube_sequence.CAP_MM - world[:, 2]
+    assert np.median(np.abs(np.minimum(to_wall_mm, to_cap_mm))) < 0.05
+    ray = world - sequence.T_world_camera[1][:3, 3]
+    distance_mm = np.linalg.norm(ray, axis=1)
+    np.testing.assert_allclose(pixels["log_distance"].exp(), distance_mm, rtol=1e-4)
+    outward = np.where((to_cap_mm < to_wall_mm)[:, None], [0, 0, 1.0], world * [1, 1, 0])
+    cos = (ray * outward).sum(axis=1) / distance_mm / np.linalg.norm(outward, axis=1)
+    assert np.median(np.abs(pixels["cos"].numpy() - cos)) < 0.02
+
+
 def test_a_few_steps_give_a_finite_lambertian_twin_that_renders(tube):
     twin = endotwin.fit_twin(tube, "endopbr", epochs=1)
     assert twin.materials.diffuse == "lambert"

@@ -1,8 +1,9 @@
 """The method ``endopbr``: Han & Wu 2025 as published, to compare with.
 
 A hash grid and a small MLP are queried at each pixel's point; light, response and field are learned
-together by Adam from pixels of a few images a step, with normals from the gradient of the depth map. When
-done, the field is sampled at the vertices, so that the twin renders like any other.
+together by Adam from pixels of a few images a step, with normals from the gradient of the depth map, or of
+the surface where photos were aligned apart from their depth maps. When done, the field is sampled at the
+vertices, so that the twin renders like any other.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ import time
 from collections.abc import Callable
 from contextlib import closing
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -24,10 +26,12 @@ from endotwin.fit.hashgrid import level_slots
 from endotwin.light import shading
 from endotwin.light.forward import Lit, Lobes, radiance
 from endotwin.light.incidence import COS_MIN
+from endotwin.pixels.samples import frame_samples
 from endotwin.pixels.start import ALBEDO_TOP
 from endotwin.run.ahead import ahead
 from endotwin.run.stopwatch import Stopwatch
 from endotwin.sequence import Frame, Sequence
+from endotwin.surface.casting import Caster
 from endotwin.surface.vectors import unit
 from endotwin.twin import Light, Materials, Response, Twin
 
@@ -133,20 +137,36 @@ def photo_geometry(twin: Twin, frame: Frame, lens_mask: np.ndarray) -> dict[str,
     }
 
 
+def surface_geometry(
+    caster: Caster, twin: Twin, frame: Frame, lens_mask: np.ndarray
+) -> dict[str, np.ndarray]:
+    """What ``photo_geometry`` returns, where rays meet the surface: of a photo that lies apart from its depth
+    map."""
+    seen = frame_samples(twin, caster, frame, lens_mask, 1.0, np.random.default_rng(0))
+    corners_mm = twin.surface.vertices_mm.astype(np.float64)[twin.surface.triangles[seen.triangle.numpy()]]
+    names = ("cos", "sin2", "log_cos_axis", "log_distance", "color")
+    return {
+        "points_mm": np.einsum("nk,nka->na", seen.barycentric.numpy(), corners_mm),
+        **{name: getattr(seen, name).numpy() for name in names},
+    }
+
+
 class Photos:
     """The geometry of photos on a device, of which a GPU keeps as many as ROOM of its free memory holds."""
 
     def __init__(self, twin: Twin, sequence: Sequence, device: torch.device):
         self._twin, self._sequence, self._device = twin, sequence, device
+        self._caster = None if twin.depth_at_photos else Caster(twin.surface)
         self._kept: dict[int, dict[str, Tensor]] = {}
         self._left = ROOM * torch.cuda.mem_get_info(device)[0] if device.type == "cuda" else 0
 
     def __getitem__(self, index: int) -> dict[str, Tensor]:
-        """``photo_geometry`` of frame ``index``."""
+        """``photo_geometry``, or ``surface_geometry``, of frame ``index``."""
         if index in self._kept:
             return self._kept[index]
         frame = self._sequence.frame(index)
-        values = photo_geometry(self._twin, frame, self._sequence.lens_mask)
+        shown = photo_geometry if self._caster is None else partial(surface_geometry, self._caster)
+        values = shown(self._twin, frame, self._sequence.lens_mask)
         found = {name: torch.from_numpy(value).to(self._device) for name, value in values.items()}
         self._left -= sum(value.nbytes for value in found.values())
         if self._left >= 0:

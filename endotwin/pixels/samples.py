@@ -266,7 +266,7 @@ def frame_samples(
     generator: np.random.Generator,
 ) -> Samples:
     chosen = lens_mask & np.isfinite(frame.depth_mm) & ~beside_black(frame.color)
-    if twin.registration is None or twin.registration.with_depth:
+    if twin.depth_at_photos:
         chosen &= ~discontinuities(frame.depth_mm)
         if share < 1:
             chosen &= generator.random(chosen.shape, np.float32) < share

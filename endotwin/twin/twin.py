@@ -225,6 +225,11 @@ class Twin:
         """The film of fluid that is seen; None without one, or without the effect."""
         return self.materials.film if self.fitted and "film" in self.effects else None
 
+    @property
+    def depth_at_photos(self) -> bool:
+        """Whether depth maps lie where their photos do: no alignment moved the photos alone."""
+        return self.registration is None or self.registration.with_depth
+
     def displayed(self, radiance: Tensor) -> Tensor:
         """Display values of radiance ≥ 0, of its shape; above 1 where a photo would clip."""
         color = respond(radiance, self.response.gamma)
