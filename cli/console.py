@@ -20,7 +20,9 @@ from endotwin.run.stopwatch import Stopwatch
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace what is there already.")]
 Profile = Annotated[
     Path | None,
-    typer.Option(metavar="FILE", help="Write each stage's seconds and the peak memory to FILE, as JSON."),
+    typer.Option(
+        metavar="FILE", help="Write each stage's seconds and the main process's peak memory to FILE, as JSON."
+    ),
 ]
 Config = Annotated[
     str,

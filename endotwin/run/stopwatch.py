@@ -1,4 +1,4 @@
-"""What a run cost: the seconds of its named stages and the most memory that the process held."""
+"""What a run cost: the seconds of its named stages and the most memory that its main process held."""
 
 from __future__ import annotations
 
@@ -15,7 +15,8 @@ except ImportError:  # Windows
 
 
 def peak_memory_mb() -> float:
-    """Most resident memory that this process has held so far, in MB (10⁶ bytes).
+    """Most resident memory that this process has held so far, in MB (10⁶ bytes). Workers that it started, as
+    those of ``synth`` and ``study``, hold their own, which is not in it.
 
     Linux's VmHWM where there is one: unlike ``ru_maxrss`` it does not start at the parent's size.
     """
@@ -74,7 +75,7 @@ class Stopwatch:
     def to_dict(self) -> dict:
         """``{"stages": {name: s}, "parts": {stage: {part: s}}, "seconds": s, "peak_memory_mb": MB}``.
 
-        ``parts`` is left out where there are none.
+        ``parts`` is left out where there are none. The memory is that of the main process.
         """
         parts = {name: _rounded(seconds) for name, seconds in self.parts.items()}
         return {
