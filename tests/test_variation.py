@@ -36,6 +36,9 @@ regions:
 """
 
 
+TWICE = "{name: twice, box: [[-100, 0, -100], [100, 100, 100]]}"
+
+
 @pytest.fixture(scope="module")
 def twin():
     return tube_twin.fitted(tube_twin.seen(tube_twin.surface()))
@@ -226,6 +229,7 @@ def test_varied_frames_do_not_depend_on_where_a_run_stopped(ranges, twin, tmp_pa
         ("regions: [{name: a, box: [[500, 0, 0], [501, 1, 1]]}]", "no vertex"),
         ("regions: [{name: a, vertices: nowhere.npy}]", "nowhere"),
         ("regions: 3", "no list"),
+        (f"regions: [{TWICE}, {TWICE}]", "two regions are called 'twice'"),
         ("material: [", "YAML"),
         pytest.param("[" * 20_000, "nested too deeply", id="deep"),
         ("regions: [{name: p, vertices: paint.txt}]", "is no vertex mask"),

@@ -197,6 +197,7 @@ def read_variation(path: Path, twin: Twin, before: Variation) -> Variation:
     if not isinstance(described, list):
         raise OptionError(f"{path}: 'regions' is no list; write '- name: …' for each region")
     regions = [read_region(each, twin.surface, Path(path)) for each in described]
+    _require_own_names(regions, path)
     return replace(
         before,
         material=before.material + kinds["material"],
@@ -211,6 +212,14 @@ def read_variation(path: Path, twin: Twin, before: Variation) -> Variation:
         effects=_effects(content.get("effects"), twin, path),
         clip=_clip(content, path),
     )
+
+
+def _require_own_names(regions: Sequence[Region], path: Path) -> None:
+    """Raise OptionError where two regions share a name, by which records tell them apart."""
+    names = [region.name for region in regions]
+    for name in names:
+        if names.count(name) > 1:
+            raise OptionError(f"{path}: two regions are called {name!r}; give each a name of its own")
 
 
 def _ranges(entries: object, kind: str, where: str, path: Path) -> tuple[Range, ...]:
