@@ -22,6 +22,7 @@ from endotwin.synth import (
 )
 from endotwin.synth.encodings import encode_depth
 from endotwin.synth.job import fingerprint
+from endotwin.synth.run.statistics import STRIDE, Statistics
 
 QUANTUM_MM = 100 / 65535
 
@@ -159,6 +160,13 @@ def test_the_datasheet_is_one_page_that_needs_no_other_file(written):
 def test_depth_is_rounded_clipped_at_100_mm_and_0_where_there_is_none():
     depth_mm = np.array([[np.nan, 1e-4, 50.001, 99.9999, 250.0, -3.0, 0.0, np.inf]], np.float32)
     np.testing.assert_array_equal(encode_depth(depth_mm), [[0, 1, 32768, 65535, 65535, 0, 0, 65535]])
+
+
+def test_depth_behind_the_lens_and_none_at_all_are_in_no_bin_of_the_statistics():
+    depth_mm = np.array([-40.0, -1e-3, 0.0, 1.9, 3.0, 99.0, 250.0, 1e30, np.nan, np.inf, -np.inf], np.float32)
+    counted = Statistics()
+    counted.add({"depth": np.repeat(np.repeat(depth_mm[None], STRIDE, axis=0), STRIDE, axis=1)})
+    assert counted.depth[[0, 1, -1]].tolist() == [2, 1, 3] and counted.depth.sum() == 6
 
 
 def test_progress_ends_at_the_number_of_frames(twin, trajectory, tmp_path):

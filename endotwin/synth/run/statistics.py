@@ -121,8 +121,9 @@ def thumbnail(images: dict[str, np.ndarray]) -> bytes:
 
 
 def _counts(values: np.ndarray, edges: np.ndarray) -> np.ndarray:
-    """How many finite ``values`` fall between even ``edges``; the last bin takes what lies beyond."""
+    """How many finite ``values`` fall between even ``edges``; the last bin takes what lies beyond, and none
+    what lies before the first edge."""
     bins = len(edges) - 1
-    finite = values[np.isfinite(values)]
-    index = ((finite - edges[0]) * np.float32(bins / (edges[-1] - edges[0]))).astype(np.int64)
-    return np.bincount(np.clip(index, 0, bins - 1), minlength=bins)
+    counted = values[np.isfinite(values) & (values >= edges[0])]
+    index = (counted - edges[0]) * np.float32(bins / (edges[-1] - edges[0]))
+    return np.bincount(np.minimum(index, bins - 1).astype(np.int64), minlength=bins)
