@@ -161,6 +161,29 @@ def test_a_training_goes_on_only_from_the_same_photos_places_and_not_from_beyond
     assert Checkpoint(tmp_path / "kept", identity(moved), optimizer).resume(7) == (0, 0.0)
 
 
+def test_of_a_damaged_checkpoint_nothing_is_restored(tmp_path):
+    """Its second parameter is of another size, or its seconds are no number."""
+
+    def training(size: int, value: float) -> torch.optim.Adam:
+        parameters = [torch.nn.Parameter(torch.full((each,), value)) for each in (3, size)]
+        return torch.optim.Adam(parameters)
+
+    def write(size: int, seconds: float | str) -> None:
+        optimizer = training(size, 1.0)
+        sum(each.sum() for each in optimizer.param_groups[0]["params"]).backward()
+        optimizer.step()
+        kept = Checkpoint(tmp_path / "kept", "same", optimizer)
+        kept._written = -np.inf
+        kept.keep(7, seconds)
+
+    for size, seconds in ((4, 1.5), (5, "soon")):
+        write(size, seconds)
+        optimizer = training(5, 0.0)
+        assert Checkpoint(tmp_path / "kept", "same", optimizer).resume(7) == (0, 0.0)
+        assert not optimizer.state
+        assert all((each == 0).all() for each in optimizer.param_groups[0]["params"])
+
+
 def test_a_budget_ends_the_training(tube):
     twin = endotwin.fit_twin(tube, "endopbr", budget_s=0.5)
     assert twin.record["fit"]["steps"] >= 1

@@ -41,13 +41,14 @@ class Checkpoint:
         try:
             with safe_open(self._path, "pt") as file:
                 about = file.metadata()
-                if about["identity"] != self._identity or int(about["step"]) > most:
+                step, seconds = int(about["step"]), float(about["seconds"])
+                if about["identity"] != self._identity or step > most:
                     return 0, 0.0
-                kept = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-            self._restore(kept, int(about["step"]))
-            return int(about["step"]), float(about["seconds"])
+                kept = [self._kept(file, number) for number in range(len(self._parameters))]
         except (OSError, SafetensorError, KeyError, TypeError, ValueError, RuntimeError):
             return 0, 0.0  # damaged: the training starts anew
+        self._restore(kept, step)
+        return step, seconds
 
     def keep(self, step: int, seconds: float) -> None:
         """Write the state after ``step`` if the last time was EVERY_S seconds ago."""
@@ -81,15 +82,16 @@ class Checkpoint:
         if self._path is not None:
             self._path.unlink(missing_ok=True)
 
-    def _restore(self, kept: dict[str, torch.Tensor], step: int) -> None:
+    def _kept(self, file: safe_open, number: int) -> list[torch.Tensor]:
+        """Value and both moments of parameter ``number``, of its shape and on its device."""
+        parameter = self._parameters[number]
+        tensors = (file.get_tensor(f"{number}.{name}") for name in ("value", "exp_avg", "exp_avg_sq"))
+        return [tensor.reshape(parameter.shape).to(parameter.device) for tensor in tensors]
+
+    def _restore(self, kept: list[list[torch.Tensor]], step: int) -> None:
         with torch.no_grad():
-            for number, parameter in enumerate(self._parameters):
-                shape = parameter.shape
-                value, mean, square = (
-                    kept[f"{number}.{name}"].reshape(shape) for name in ("value", "exp_avg", "exp_avg_sq")
-                )
+            for parameter, (value, mean, square) in zip(self._parameters, kept, strict=True):
                 parameter.copy_(value)
-                mean, square = mean.to(parameter.device), square.to(parameter.device)
                 moments = {"step": torch.tensor(float(step)), "exp_avg": mean, "exp_avg_sq": square}
                 self._optimizer.state[parameter] = moments
 
