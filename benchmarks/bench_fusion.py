@@ -10,6 +10,7 @@ import numpy as np
 
 from endotwin.fusion import fuse
 from endotwin.fusion.agreement import Tolerance, agreement
+from endotwin.fusion.faces import split
 from endotwin.fusion.tsdf import fuse_tsdf
 from endotwin.fusion.views import read_views
 from endotwin.run.stopwatch import peak_memory_mb
@@ -48,7 +49,7 @@ def main(path: Path) -> None:
     origin_mm = sequence.T_world_camera[:, :3, 3].mean(axis=0)
 
     start = time.perf_counter()
-    fuse_tsdf(camera, read_views(sequence, frames), origin_mm, VOXEL_MM, noise_mm=0.0)
+    fuse_tsdf(split(camera), read_views(sequence, frames), origin_mm, VOXEL_MM, noise_mm=0.0)
     seconds = time.perf_counter() - start
     print(f"TSDF at {VOXEL_MM} mm, decoding included: {len(frames) / seconds:.1f} frames/s")
 

@@ -1,6 +1,7 @@
 """Fusion against scenes whose surface is known."""
 
 import logging
+import weakref
 from dataclasses import replace
 from pathlib import Path
 
@@ -230,6 +231,11 @@ def test_faces_cover_every_lens_pixel_with_depth(camera):
         covered[face.corners[0]] = True
     ahead = camera.pixel_directions[..., 2].reshape(-1) > 0.02
     assert covered[ahead].all()
+
+
+def test_faces_are_let_go_once_nobody_uses_them():
+    face = weakref.ref(split(scenes.omni())[0])
+    assert face() is None
 
 
 def test_faces_carry_depth_without_loss():

@@ -14,6 +14,7 @@ from endotwin.fusion.choice import WORTH_PIXELS, chosen, compared, differing, gl
 from endotwin.fusion.coverage import covered, covered_by_glances
 from endotwin.fusion.denoise import denoised, pixel_noise
 from endotwin.fusion.doubts import doubt_frames, doubt_scatter, without_strays
+from endotwin.fusion.faces import split
 from endotwin.fusion.holes import filled
 from endotwin.fusion.margin import with_margin
 from endotwin.fusion.mesh import surface_of, without_short_edges
@@ -107,7 +108,8 @@ def fuse(
         )
     origin_mm = np.median(np.asarray(sequence.T_world_camera, np.float64)[frames, :3, 3], axis=0)
     coarse_mm = COARSE_VOXELS * max(finest_mm, voxel_mm or 0.0)
-    coarse = fuse_tsdf(camera, views("noise", sample), origin_mm, coarse_mm, noise_mm=0.0)
+    faces = split(camera)
+    coarse = fuse_tsdf(faces, views("noise", sample), origin_mm, coarse_mm, noise_mm=0.0)
     noise = measured_noise(camera, surface_of(origin_mm, *coarse), views("noise", sample))
     if voxel_mm is None:
         voxel_mm = max(voxel * max(finest_mm, noise * median_mm), least_mm)
@@ -120,7 +122,7 @@ def fuse(
         frames = [glance.index for glance in seen]
     fused = frames if seen is None else chosen(camera, seen, 1 if width_px < 1 else NOISY_FOLD)
     vertices_mm, triangles = fuse_tsdf(
-        camera, views("TSDF", fused, warn=True), origin_mm, voxel_mm, noise * median_mm
+        faces, views("TSDF", fused, warn=True), origin_mm, voxel_mm, noise * median_mm
     )
     vertices_mm, triangles = without_short_edges(vertices_mm, triangles, SHORTEST_EDGE_VOXELS * voxel_mm)
     surface = surface_of(origin_mm, vertices_mm, triangles)

@@ -8,7 +8,6 @@ camera.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
 
 import numpy as np
 
@@ -53,7 +52,6 @@ class Face:
         return depth.reshape(self.height, self.width)
 
 
-@lru_cache(maxsize=1)
 def split(camera: Camera) -> tuple[Face, ...]:
     """Faces that cover every pixel of ``camera`` whose ray has z > 0 (z-depth says nothing about the
     others)."""

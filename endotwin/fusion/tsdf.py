@@ -9,7 +9,7 @@ import numpy as np
 from endotwin.cameras import Camera
 from endotwin.errors import SequenceError
 from endotwin.fusion._open3d import o3c, o3d
-from endotwin.fusion.faces import Face, split
+from endotwin.fusion.faces import Face
 from endotwin.fusion.views import View
 
 BLOCK_VOXELS = 8
@@ -57,11 +57,12 @@ def footprint_voxel_mm(camera: Camera, views: Iterable[View]) -> tuple[float, fl
 
 
 def fuse_tsdf(
-    camera: Camera, views: Iterable[View], origin_mm: np.ndarray, voxel_mm: float, noise_mm: float
+    faces: tuple[Face, ...], views: Iterable[View], origin_mm: np.ndarray, voxel_mm: float, noise_mm: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Integrate views and extract the zero level set.
 
     Args:
+        faces: of the views' camera, see ``faces.split``.
         origin_mm: float64 [3], the local origin in the world; poses are taken relative to it before they
             become float32.
 
@@ -73,7 +74,6 @@ def fuse_tsdf(
     Raises:
         SequenceError: no view has a surface.
     """
-    faces = split(camera)
     truncation_voxels = max(TRUNCATION_VOXELS, TRUNCATION_SIGMAS * noise_mm / voxel_mm)
     grid = o3d.t.geometry.VoxelBlockGrid(
         ("tsdf", "weight"), (o3c.float32, o3c.float32), ((1,), (1,)), voxel_mm, BLOCK_VOXELS, 10_000
