@@ -180,10 +180,18 @@ def _checked(value: object, kind: str, key: str, origin: str) -> object:
         except OptionError as error:
             raise OptionError(f"{origin}: fit.budget: {error}") from error
     least = LEAST.get(key.split(".")[1], 1)
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not _finite(value):
         raise OptionError(f"{origin}: {key} is {value!r}, but must be a number")
     if kind.startswith("int") and (value != int(value) or value < least):
         raise OptionError(f"{origin}: {key} is {value!r}, but must be a whole number of at least {least}")
     if kind == "float" and not value > 0:
         raise OptionError(f"{origin}: {key} is {value!r}, but must be greater than 0")
     return int(value) if kind.startswith("int") else float(value)
+
+
+def _finite(value: float) -> bool:
+    """Whether floating point holds the number: a whole one of more than 308 digits is too large for it."""
+    try:
+        return math.isfinite(value)
+    except OverflowError:
+        return False

@@ -79,6 +79,8 @@ def test_what_a_file_leaves_out_is_as_in_standard(tmp_path):
         ("fit: {budget: soon}", ["fit.budget", "soon"]),
         ("fuse: {scale: 0}", ["fuse.scale", "greater than 0"]),
         ("fuse: {scale: .nan}", ["fuse.scale", "number"]),
+        pytest.param(f"fuse: {{scale: 1{'0' * 400}}}", ["fuse.scale", "number"], id="huge"),
+        pytest.param(f"fit: {{pixels: 1{'0' * 400}}}", ["fit.pixels", "number"], id="huge whole"),
         ("fuse: {scale: null}", ["fuse.scale", "number"]),
         ("fuse: 3", ["fuse", "3"]),
         ("- fuse", ["keys with values"]),

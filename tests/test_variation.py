@@ -223,6 +223,8 @@ def test_varied_frames_do_not_depend_on_where_a_run_stopped(ranges, twin, tmp_pa
         ("per: clip\nclip: 0", "number of frames"),
         ("effects: {confetti: on}", r"confetti.*noise"),
         ("effects: {offset: on}", "no defaults"),
+        ("effects: {noise: [0.5]}", r"'noise' is \[0\.5\]; write on, off, or a chance"),
+        ("effects: {noise: {on: 0.5}}", "write on, off, or a chance"),
         ("parameters: [noise.colour*2]", r"noise\.read_noise"),
         ("regions: [{name: a, material: []}]", "lacks a part"),
         ("regions: [{name: a, box: [1, 2], material: []}]", "two corners"),
