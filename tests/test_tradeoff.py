@@ -151,6 +151,12 @@ def test_the_stages_add_up_to_the_seconds_of_the_commands():
     assert sum(shares.values()) == pytest.approx(17)
 
 
+def test_the_machine_has_the_cores_that_the_process_may_use(monkeypatch):
+    monkeypatch.setattr("os.cpu_count", lambda: 64)
+    monkeypatch.setattr("os.sched_getaffinity", lambda process: {0, 5, 9}, raising=False)
+    assert run.machine().startswith("3 cores, ")
+
+
 def test_the_patch_is_lit_and_where_the_detail_is(tmp_path):
     """A photo that is flat but for a checkered corner, and a frame whose brighter checkers are clipped."""
     folder = tube_sequence.write(tmp_path / "tube", frames=3)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import platform
 import shutil
 from collections.abc import Callable
@@ -11,6 +10,7 @@ from pathlib import Path
 from endotwin.errors import OptionError, OutputError
 from endotwin.pipeline import GEOMETRIES
 from endotwin.run.output import TRADEOFF, check_free, goes_on, move_folder, unwritable
+from endotwin.run.threads import cores
 from endotwin.sequence import Sequence
 from endotwin.sequence.fingerprints import checksum, fingerprints
 from endotwin.sequence.readers import open_sequence
@@ -152,7 +152,7 @@ def _measure(
 
 
 def machine() -> str:
-    """What it was measured on, in words."""
+    """What it was measured on, in words; of its cores, those that this process may use."""
     model = platform.processor() or platform.machine()
     info = Path("/proc/cpuinfo")
     if info.exists():
@@ -160,4 +160,4 @@ def machine() -> str:
             line for line in info.read_text(encoding="utf-8").splitlines() if line.startswith("model name")
         ]
         model = lines[0].split(":", 1)[1].strip() if lines else model
-    return f"{os.cpu_count()} cores, {model}, {platform.system()}"
+    return f"{cores()} cores, {model}, {platform.system()}"
