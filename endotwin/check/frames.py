@@ -46,7 +46,7 @@ def frame_findings(
             progress("check frames", index + 1, len(sequence))
     sharpness, match = np.array(shots).T
     names = [file.name for file in sequence.color_files]
-    findings, notes = _repeated(sequence, names, steps)
+    findings, notes = _repeated(names, steps)
     if empty:
         notes.append(f"{_listed(empty)}: hardly any usable depth.")
     told = {name for finding in findings for name in finding.frames}
@@ -59,7 +59,7 @@ def frame_findings(
     return findings, notes
 
 
-def _repeated(sequence: Sequence, names: list[str], steps: list[Step]) -> tuple[list[Finding], list[str]]:
+def _repeated(names: list[str], steps: list[Step]) -> tuple[list[Finding], list[str]]:
     """Frames that are stored twice, and a note of those between which nothing moves."""
     groups: dict[str, list[str]] = {}
     still = []

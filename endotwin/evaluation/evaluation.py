@@ -376,7 +376,7 @@ def evaluate(
     lpips = _network(lpips)
     if sheet is not None:
         check_picture(sheet, overwrite)
-    sequence, indices = _to_be_scored(twin, sequence, renders)
+    sequence, indices = _to_be_scored(twin, sequence)
     if renders is None:
         show = _shown_by_twin(twin, sequence)
     else:
@@ -423,9 +423,7 @@ def _network(lpips: str | None) -> str:
     return lpips
 
 
-def _to_be_scored(
-    twin: Twin | None, sequence: Sequence | Path | str | None, renders: Path | str | None
-) -> tuple[Sequence, list[int]]:
+def _to_be_scored(twin: Twin | None, sequence: Sequence | Path | str | None) -> tuple[Sequence, list[int]]:
     """The sequence and the indices of its frames that are scored."""
     if sequence is None:
         if twin is None:

@@ -34,7 +34,7 @@ SHRINK = (1.0, 0.75, 0.5, 0.35, 0.25)
 SHADOW_SHARE = 0.015
 """A photo sees a point if a ray from its lens meets nothing nearer, but for this share of its length."""
 
-INK, DIM, GROUND = (232, 232, 232), (150, 156, 166), (0x14, 0x16, 0x1A)
+INK, GROUND = (232, 232, 232), (0x14, 0x16, 0x1A)
 FONT, LINE_PX, MARGIN_PX = 0.42, 18, 8
 
 

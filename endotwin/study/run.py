@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import logging
 import shutil
 import time
 from collections.abc import Callable
@@ -53,8 +52,6 @@ SUPERSAMPLING = 2
 
 MOST = 1_000_000
 """Of frames, seeds and steps, each."""
-
-logger = logging.getLogger("endotwin")
 
 
 @dataclass(frozen=True)

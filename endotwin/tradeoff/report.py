@@ -141,7 +141,7 @@ def write(rows: list[dict], by_effect: list[dict], facts: dict, work: Path) -> N
         sequence=html.escape(facts["sequence"]),
         protocol=f"{len(rows)} rungs, {runs}, {geometry}",
         machine=html.escape(facts["machine"]),
-        answer=_answer(rows, order, front, best),
+        answer=_answer(rows, front, best),
         plot=plot,
         knee=KNEE,
         table=_table(rows, order, front, best),
@@ -154,7 +154,7 @@ def write(rows: list[dict], by_effect: list[dict], facts: dict, work: Path) -> N
     (work / "tradeoff.html").write_text(page, encoding="utf-8")
 
 
-def _answer(rows: list[dict], order: list[int], front: list[int], best: int | None) -> str:
+def _answer(rows: list[dict], front: list[int], best: int | None) -> str:
     """The page's first sentence: what to use."""
     top, fast = rows[front[-1]], rows[front[0]]
     if top is fast:
