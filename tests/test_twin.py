@@ -58,6 +58,15 @@ def test_an_unfitted_twin_loads_unfitted_over_a_fitted_one(twin, tmp_path):
     assert not list((tmp_path / "twin").glob("materials*"))
 
 
+def test_what_needs_materials_says_that_a_twin_has_none_yet(twin, tmp_path):
+    twin.require_fitted()
+    unfitted = tube_twin.unfitted(twin)
+    for need in (unfitted.require_fitted, lambda: unfitted.export(tmp_path / "twin.ply")):
+        with pytest.raises(TwinError, match="no materials yet; run 'endotwin fit'"):
+            need()
+    assert not list(tmp_path.iterdir())
+
+
 def test_a_twin_that_exists_is_refused_untouched(twin, tmp_path):
     twin.save(tmp_path / "twin")
     with pytest.raises(OutputError, match="--overwrite"):

@@ -34,8 +34,7 @@ def export(twin: Twin | Path | str, path: Path | str, overwrite: bool = False) -
     path = Path(path)
     check_export(path, overwrite)
     twin = as_twin(twin)
-    if not twin.fitted:
-        raise TwinError("the twin has no materials yet; run 'endotwin fit' on it first")
+    twin.require_fitted()
     if not len(twin.surface.triangles):
         raise TwinError("the twin has no triangle that could be exported; fuse its sequence again")
     _writer(path.suffix.lower())(twin, path, overwrite)

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from endotwin.cameras import Camera
-from endotwin.errors import OptionError, TwinError
+from endotwin.errors import OptionError
 from endotwin.light.forward import Lit
 from endotwin.light.incidence import to_camera
 from endotwin.render.illumination import Illumination, ViewLight
@@ -118,8 +118,7 @@ class Renderer:
         exposure: Sequence[float] | float = 1.0,
     ):
         twin = as_twin(twin)
-        if not twin.fitted:
-            raise TwinError("the twin has no materials yet; run 'endotwin fit' on it first")
+        twin.require_fitted()
         self.twin = twin
         self.camera = camera or twin.camera
         self.caster = caster or Caster(twin.surface, threads)

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from endotwin.cameras import Camera
-from endotwin.errors import OptionError, TwinError
+from endotwin.errors import OptionError
 from endotwin.run.arguments import texts
 from endotwin.sequence.spread import spread
 from endotwin.surface import Surface
@@ -62,8 +62,7 @@ def one_by_one(
     Raises:
         TwinError: the twin is not fitted. OptionError: there are more than ``room``, with the text ``full``.
     """
-    if not twin.fitted:
-        raise TwinError("the twin has no materials yet; run 'endotwin fit' on it first")
+    twin.require_fitted()
     asked = [(spec, *parse(spec)) for spec in texts(name, specs)]
     if sum(options.count for *_, options in asked) > room:
         raise OptionError(full)

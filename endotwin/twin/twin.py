@@ -220,6 +220,11 @@ class Twin:
     def fitted(self) -> bool:
         return self.materials is not None
 
+    def require_fitted(self) -> None:
+        """Raise TwinError unless the twin is fitted."""
+        if not self.fitted:
+            raise TwinError("the twin has no materials yet; run 'endotwin fit' on it first")
+
     @property
     def film(self) -> Film | None:
         """The film of fluid that is seen; None without one, or without the effect."""

@@ -13,7 +13,7 @@ import numpy as np
 
 from endotwin.cameras import Camera
 from endotwin.effects.video import CLIP_FRAMES, Video
-from endotwin.errors import EndotwinError, OptionError, OutputError, TwinError
+from endotwin.errors import EndotwinError, OptionError, OutputError
 from endotwin.run.output import DATASET, check_apart, unwritable
 from endotwin.run.processes import Pool
 from endotwin.sequence.poses import TIME_DIGITS
@@ -138,8 +138,7 @@ def make_job(
     motion: Motion | None = None,
 ) -> Job:
     """The job of ``synthesize``'s arguments; raises TwinError or OptionError where they do not fit."""
-    if not twin.fitted:
-        raise TwinError("the twin has no materials yet; run 'endotwin fit' on it first")
+    twin.require_fitted()
     if layout not in LAYOUTS:
         raise OptionError(f"there is no layout {layout!r}; choose one of {', '.join(LAYOUTS)}")
     still = [label for label in labels if motion is None and label in OF_MOTION]
