@@ -87,7 +87,7 @@ def seconds(text: str | float) -> float:
 
 
 def preset_names() -> list[str]:
-    """Names of the presets that ship with endotwin, fastest first where their numbers tell."""
+    """Names of the presets that ship with endotwin, in the order of the alphabet."""
     names = [entry.name for entry in resources.files("endotwin.configs").iterdir()]
     return sorted(name.removesuffix(".yaml") for name in names if name.endswith(".yaml"))
 

@@ -77,6 +77,8 @@ class FrameScore:
         psnr, ssim, lpips: over its valid pixels.
         psnr_covered, ssim_covered, lpips_covered: over its covered pixels.
         covered: fraction of the valid pixels that are covered; NaN where no twin tells.
+        psnr_dull: over its valid pixels with no highlight near them.
+        precision, recall, sizes: how alike the highlights are, see ``Alike``.
         psnr_halves, psnr_halves_covered: of each half of the photo at a pose that was fitted to the other
             half; NaN where that was not asked for.
     """

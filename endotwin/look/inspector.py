@@ -113,9 +113,9 @@ def inspect(
     Args:
         twin: or its folder.
         screenshot: PNG file to write instead of opening a window.
-        map: ``base_color``, ``roughness``, ``metallic``, ``coverage`` or ``normals``: the window's first, the
-            sheet's only one; ``scope``: the window's pane with the view through the scope. All maps unless
-            given.
+        map: ``base_color``, ``roughness``, ``metallic``, ``film`` (where there is one), ``coverage`` or
+            ``normals``: the window's first, the sheet's only one; ``scope``: the window's pane with the view
+            through the scope. All maps unless given.
         overwrite: whether ``screenshot`` may exist.
         keyframes: pose file that the key k adds the window's view to, for the trajectory ``spline:FILE``.
 
