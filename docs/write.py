@@ -33,7 +33,8 @@ PARAMETERS = """
 
 What `parameters:` of `--vary` edits, with `*`, `+`, `-` or `=` and a number or a range, where the effect is
 on. What a twin's effects have is in its `twin.json`; the defaults are of effects that are switched on and
-that the photos of the twin's sequence do not tell.
+that the photos of the twin's sequence do not tell. A factor or a sum that would lead beyond the least or the
+most leads there, and `frames.jsonl` has that factor or sum.
 
 """
 

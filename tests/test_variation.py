@@ -169,7 +169,7 @@ def test_a_painted_region_takes_the_edit_by_its_weight(twin, tmp_path, kind):
 
 
 def test_effects_are_switched_by_their_chance_and_their_parameters_drawn(ranges, twin):
-    read = ranges("effects: {coat: 0.25, noise: on}\nparameters: [coat.weight*0.5..2, noise.read_noise=9]")
+    read = ranges("effects: {coat: 0.25, noise: on}\nparameters: [coat.weight*0.5..2, noise.read_noise+9]")
     draws = read.draw(range(400), 0)
     assert 0.18 < np.mean([dict(draw.effects)["coat"] for draw in draws]) < 0.32
     with_coat = next(draw for draw in draws if dict(draw.effects)["coat"])
@@ -181,6 +181,10 @@ def test_effects_are_switched_by_their_chance_and_their_parameters_drawn(ranges,
     assert with_coat.to_dict()["effects"] == {"coat": "on", "noise": "on"}
     off = ranges("effects: {coat: off}").draw(range(1), 0)[0]
     assert "coat" not in off.edited(edited)[0].effects
+
+
+def test_a_parameter_may_be_negative_where_its_limits_are(ranges):
+    assert ranges("parameters: [vignetting.k2=-1..0.5]").parameters[0].low == -1
 
 
 def test_the_lights_offset_moves_every_guide(ranges, twin):
@@ -226,6 +230,11 @@ def test_varied_frames_do_not_depend_on_where_a_run_stopped(ranges, twin, tmp_pa
         ("effects: {noise: [0.5]}", r"'noise' is \[0\.5\]; write on, off, or a chance"),
         ("effects: {noise: {on: 0.5}}", "write on, off, or a chance"),
         ("parameters: [noise.colour*2]", r"noise\.read_noise"),
+        ("parameters: [noise.read_noise=9]", r"read_noise lies between 0 and 0\.2"),
+        ("parameters: [noise.read_noise=0.1..0.3]", r"read_noise lies between 0 and 0\.2"),
+        ("parameters: [noise.read_noise*-1..1]", "cannot be negative"),
+        ("response: [gamma=0]", r"at least 0\.15"),
+        ("response: [gamma*0.001..1]", r"at least 0\.15"),
         ("regions: [{name: a, material: []}]", "lacks a part"),
         ("regions: [{name: a, box: [1, 2], material: []}]", "two corners"),
         ("regions: [{name: a, box: [[500, 0, 0], [501, 1, 1]]}]", "no vertex"),

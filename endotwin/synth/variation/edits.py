@@ -5,10 +5,11 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from math import isfinite
+from math import inf, isfinite
 
 import numpy as np
 
+from endotwin.effects import effect_class
 from endotwin.errors import OptionError
 from endotwin.twin import Light, Materials, Response
 
@@ -28,6 +29,9 @@ OFFSETS = ("offset.x", "offset.y", "offset.z")
 
 RESPONSES = ("gamma", "gain")
 """γ of the camera response, and a factor on the radiance before it, 1 unless edited; the least is 0."""
+
+GAMMA_LEAST = 0.15
+"""The least γ that a fit finds; less shows nearly every radiance alike."""
 
 OPERATIONS = {
     "*": lambda value, number: value * number,
@@ -96,10 +100,10 @@ def edit_light(light: Light, edits: Iterable[Edit]) -> Light:
 
 
 def edit_response(response: Response, edits: Iterable[Edit]) -> Response:
-    """The response after ``edits`` of ``gamma``, at least 0; ``gain`` is ``exposure``'s."""
+    """The response after ``edits`` of ``gamma``, at least GAMMA_LEAST; ``gain`` is ``exposure``'s."""
     for edit in edits:
         if edit.name == "gamma":
-            response = replace(response, gamma=max(0.0, float(edit.apply(response.gamma))))
+            response = replace(response, gamma=max(GAMMA_LEAST, float(edit.apply(response.gamma))))
     return response
 
 
@@ -125,12 +129,29 @@ def parse_edit(text: str, kind: str, names: tuple[str, ...]) -> Edit:
 
 
 def require_possible(name: str, operation: str, value: float, text: str, kind: str) -> None:
-    """Raise OptionError for a factor or a value that would make the parameter negative, or a material more
-    than 1."""
-    if operation in "*=" and value < 0 and name not in OFFSETS:
+    """Raise OptionError for a factor that would make the parameter negative where it cannot be, for a value
+    beyond its limits, and for a γ, or a factor on it, below GAMMA_LEAST."""
+    low, high = limits(name)
+    if operation in "*=" and value < 0 <= low:
         raise OptionError(f"{kind} edit {text!r}: {name} cannot be negative; write a number of at least 0")
-    if operation == "=" and value > 1 and name in MATERIALS:
-        raise OptionError(f"{kind} edit {text!r}: {name} lies between 0 and 1; write such a number")
+    if name == "gamma" and operation in "*=" and value < GAMMA_LEAST:
+        raise OptionError(
+            f"{kind} edit {text!r}: so small a γ shows all light alike; write at least {GAMMA_LEAST}"
+        )
+    if operation == "=" and not low <= value <= high:
+        raise OptionError(
+            f"{kind} edit {text!r}: {name} lies between {low:g} and {high:g}; write such a number"
+        )
+
+
+def limits(name: str) -> tuple[float, float]:
+    """The least and the greatest value of what can be edited under ``name``."""
+    if name in OFFSETS:
+        return -inf, inf
+    if name in (*MATERIALS, *LIGHTS, *TINTS, *RESPONSES):
+        return 0.0, 1.0 if name in MATERIALS else inf
+    effect, _, parameter = name.partition(".")
+    return next((each.low, each.high) for each in effect_class(effect).parameters() if each.name == parameter)
 
 
 def split_edit(text: str, kind: str, names: tuple[str, ...]) -> tuple[str, str, str]:

@@ -14,7 +14,7 @@ from endotwin.effects.shadows import Shadows
 from endotwin.errors import OptionError
 from endotwin.light.guides import AT_LENS
 from endotwin.sequence.readers import open_sequence
-from endotwin.synth.variation.edits import OFFSETS, Edit
+from endotwin.synth.variation.edits import OFFSETS, Edit, limits
 from endotwin.twin import Twin
 
 logger = logging.getLogger("endotwin")
@@ -91,8 +91,7 @@ def edit_effects(effects: Effects, edits: Iterable[Edit]) -> Effects:
     for edit in edits:
         name, _, parameter = edit.name.partition(".")
         if name in effects:
-            low, high = next((p.low, p.high) for p in effects[name].parameters() if p.name == parameter)
-            value = np.clip(edit.apply(getattr(effects[name], parameter)), low, high)
+            value = np.clip(edit.apply(getattr(effects[name], parameter)), *limits(edit.name))
             effects = effects.including(replace(effects[name], **{parameter: float(value)}))
     return effects
 
