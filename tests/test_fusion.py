@@ -304,6 +304,21 @@ def test_a_frame_without_depth_is_skipped_and_named(tube, caplog, monkeypatch):
     assert record == {"fused": [0], "nothing_new": 0}
 
 
+@pytest.mark.parametrize(
+    ("scale", "voxel_mm", "unit", "told"),
+    [(0.5, 2, 1, False), (0.1, None, 1, False), (0.25, None, 0.1, True), (0.25, 2, 10, True)],
+)
+def test_poses_that_contradict_depth_are_told_and_coarse_voxels_are_not(
+    example, caplog, scale, voxel_mm, unit, told
+):
+    sequence = open_sequence(example, scale=scale)
+    T_world_camera = sequence.T_world_camera.copy()
+    T_world_camera[:, :3, 3] *= unit
+    with caplog.at_level(logging.WARNING, "endotwin"):
+        fuse(replace(sequence, T_world_camera=T_world_camera), voxel_mm=voxel_mm)
+    assert any("unit" in record.getMessage() for record in caplog.records) == told
+
+
 def test_no_valid_depth_at_all_is_one_sentence(tube):
     blank = replace(tube, read_depth_mm=lambda path: np.full((120, 160), np.nan, np.float32))
     for voxel_mm in (None, VOXEL_MM):

@@ -38,7 +38,10 @@ SHORTEST_EDGE_VOXELS = 0.25
 NOISY_FOLD = 4
 """So many frames see each place where depth is noisy, and is averaged over them."""
 COARSE_VOXELS = 2.5
-"""The noise is measured about a surface this many times coarser, whose truncation band it rarely leaves."""
+"""The noise is measured about a surface this many times coarser than the finest, whose truncation band it
+rarely leaves."""
+COARSE_ERRS = 0.3
+"""Share of its voxel by which that surface itself errs where much bends within one."""
 REACH_SIGMAS = 3.0
 WIDTH_PX = 4.0
 """Distances are averaged over so many pixels where their noise is as large as the finest voxel."""
@@ -107,14 +110,13 @@ def fuse(
             f"A voxel of {voxel_mm:g} mm needs more than 2 GB of memory; choose {least_mm:.2g} or more."
         )
     origin_mm = np.median(np.asarray(sequence.T_world_camera, np.float64)[frames, :3, 3], axis=0)
-    coarse_mm = COARSE_VOXELS * max(finest_mm, voxel_mm or 0.0)
-    faces = split(camera)
+    coarse_mm, faces = COARSE_VOXELS * finest_mm, split(camera)
     coarse = fuse_tsdf(faces, views("noise", sample), origin_mm, coarse_mm, noise_mm=0.0)
     noise = measured_noise(camera, surface_of(origin_mm, *coarse), views("noise", sample))
     if voxel_mm is None:
         voxel_mm = max(voxel * max(finest_mm, noise * median_mm), least_mm)
     tolerance = Tolerance.of(voxel_mm, noise)
-    doubt_scatter(sequence, max(noise, scatter))
+    doubt_scatter(sequence, max(noise - COARSE_ERRS * coarse_mm / median_mm, scatter))
 
     seen = None
     if len(frames) * camera.width * camera.height > WORTH_PIXELS:
