@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import logging
+import os
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, replace
 from numbers import Integral, Real
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from endotwin.config import STANDARD, FitConfig, FuseConfig
+from endotwin.config import STANDARD, Config, FitConfig, FuseConfig, load_config
 from endotwin.effects import checked_states
 from endotwin.errors import OptionError, SequenceError, TwinError
 from endotwin.fit import fit
 from endotwin.render.price import priced
-from endotwin.run.arguments import check_positive, check_whole
+from endotwin.run.arguments import as_path, check_positive, check_progress, check_whole
 from endotwin.run.stopwatch import Stopwatch
 from endotwin.sequence.readers import open_sequence
 from endotwin.twin import Source, Twin, as_twin
@@ -22,6 +23,7 @@ from endotwin.twin import Source, Twin, as_twin
 if TYPE_CHECKING:
     import numpy as np
 
+    from endotwin.cameras import Camera
     from endotwin.sequence import Sequence
     from endotwin.synth import Limits, Summary
 
@@ -39,7 +41,7 @@ def fuse_twin(
     scale: float | None = None,
     geometry: str = "known",
     voxel_mm: float | None = None,
-    config: FuseConfig = STANDARD.fuse,
+    config: FuseConfig | Config | Path | str = STANDARD.fuse,
     progress: Progress | None = None,
     undistort: tuple[int, int] | None = None,
     without: Iterable[int] | int = (),
@@ -53,7 +55,7 @@ def fuse_twin(
         geometry: ``known`` fuses the depth of every frame (Han & Wu's protocol); ``heldout`` leaves out the
             depth of the held-out frames too. Neither uses their photos.
         voxel_mm: voxel edge; chosen from the depth footprint, times the config's factor, unless given.
-        config: how finely to fuse.
+        config: how finely to fuse; or the name of a preset, or the file of a config.
         progress: called with (label, done, total).
         undistort: width and height of a pinhole image to resample to first, as published comparisons do.
         without: indices of frames that are left out: neither fused nor fitted nor scored by.
@@ -64,10 +66,11 @@ def fuse_twin(
     """
     if geometry not in GEOMETRIES:
         raise OptionError(f"geometry {geometry!r} is unknown; choose one of {', '.join(GEOMETRIES)}")
-    scale = config.scale if scale is None else scale
-    check_positive("scale", scale)
+    check_progress(progress)
+    config = _whole(config, "fuse").fuse
+    scale = check_positive("scale", config.scale if scale is None else scale)
     if voxel_mm is not None:
-        check_positive("voxel size", voxel_mm)
+        voxel_mm = check_positive("voxel size", voxel_mm)
     stopwatch = Stopwatch()
     with stopwatch.stage("open"):
         sequence = open_sequence(path, format=format, scale=scale, undistort=undistort)
@@ -78,10 +81,9 @@ def fuse_twin(
         geometry,
         frames=config.frames,
         split=sequence.split,
-        undistort=undistort,
+        undistort=None if undistort is None else (sequence.camera.width, sequence.camera.height),
     )
-    if left_out := [without] if isinstance(without, Real) else list(without):
-        _check_frames(left_out, sequence)
+    if left_out := _frames(without, sequence):
         source = source.without(left_out, len(sequence))
         sequence = source.limited(sequence)
     training = source.training(len(sequence))
@@ -130,6 +132,7 @@ def align_twin(twin: Twin | Path | str, state: str = "auto", *, progress: Progre
     """
     from endotwin.align import align
 
+    check_progress(progress)
     return align(_as_recorded(twin), state, progress)[0]
 
 
@@ -140,11 +143,11 @@ def fit_twin(
     budget_s: float | None = None,
     epochs: int | None = None,
     seed: int = 0,
-    config: FitConfig = STANDARD.fit,
+    config: FitConfig | Config | Path | str = STANDARD.fit,
     effects: Mapping[str, str] | None = None,
     align: str | None = None,
     progress: Progress | None = None,
-    checkpoint: Path | None = None,
+    checkpoint: Path | str | None = None,
     device: str = "cpu",
 ) -> Twin:
     """Fit materials, light and response to the training photos.
@@ -155,8 +158,9 @@ def fit_twin(
         budget_s: give the best twin of so many seconds; the config's unless given.
         epochs: stop after so many passes over the training photos (``endopbr``).
         seed: of all random choices.
-        config: how much work to do.
-        effects: auto, on or off by name of the effect (see ``endotwin.effects.NAMES``); auto unless named.
+        config: how much work to do; or the name of a preset, or the file of a config.
+        effects: auto, on or off by name of the effect (see ``endotwin.effects.NAMES``); the config's unless
+            named.
         align: auto, on or off, as of ``align_twin``. Unless given, what was decided about the twin before
             holds, and else auto; but off under a budget, or for ``endopbr``.
         progress: called with (label, done, total).
@@ -167,14 +171,20 @@ def fit_twin(
         OptionError: an option makes no sense. SequenceError: the twin's sequence has moved or cannot be read.
         TwinError: polyps were grown on the twin.
     """
+    check_progress(progress)
     if budget_s is not None:
-        check_positive("budget", budget_s)
+        budget_s = check_positive("budget", budget_s)
     if epochs is not None:
-        check_whole("number of epochs", epochs, 1)
-    check_whole("seed", seed)
-    effects = checked_states(effects or {})
+        epochs = check_whole("number of epochs", epochs, 1)
+    if checkpoint is not None:
+        checkpoint = as_path("checkpoint", checkpoint)
+    seed = check_whole("seed", seed)
+    settings = _whole(config, "fit")
+    effects = {**settings.effects, **checked_states(effects or {})}
     twin = _as_recorded(twin)
-    config = replace(config, method=method or config.method, budget=budget_s or config.budget)
+    config = replace(
+        settings.fit, method=method or settings.fit.method, budget=budget_s or settings.fit.budget
+    )
     undecided = "align" not in twin.record and config.method == "twin" and config.budget is None
     if align is not None or undecided:
         twin = align_twin(twin, align or "auto", progress=progress)
@@ -199,7 +209,7 @@ def synthesize(
     material: Iterable[str] | str = (),
     light: Iterable[str] | str = (),
     vary: Path | str | None = None,
-    camera: Path | str | None = None,
+    camera: Camera | Path | str | None = None,
     effects: Mapping[str, str] | None = None,
     motion: Iterable[str] | str = (),
     polyps: Iterable[str] | str = (),
@@ -222,7 +232,7 @@ def synthesize(
         out: the folder to make. A run that stops leaves ``OUT.partial``, and the same call goes on there.
         material: one edit such as ``roughness*1.3``, or several. light: such as ``intensity*0.8``.
         vary: YAML file of ranges that edits are drawn from (see ``endotwin.synth.read_variation``).
-        camera: a ``camera.json`` to render through; the twin's own camera unless given.
+        camera: to render through, or its ``camera.json``; the twin's own unless given.
         effects: on or off by name; noise and lens get the strength that is measured in the twin's sequence,
             or in that whose path stands under the name ``like``.
         motion: of the tissue, such as ``peristalsis:amplitude=1`` or ``breathing``, one or several (see
@@ -247,7 +257,10 @@ def synthesize(
     """
     from endotwin.synth import Crew, Order, render_dataset
 
-    check_whole("number of workers", workers)
+    workers, out = check_whole("number of workers", workers), as_path("dataset", out)
+    if scheduler is not None and not isinstance(scheduler, str):
+        raise OptionError(f"the scheduler is {scheduler!r}, but must be an address such as tcp://host:8786")
+    check_progress(progress)
     varied = (material, light, vary, camera, effects)
     order = Order(trajectory, *varied, motion, polyps, fluids, labels, layout, limits, seed)
     with Crew(1 if scheduler else workers) as crew:
@@ -317,7 +330,7 @@ def _with(
     """The twin with what ``specs`` ask for ``added``, where the ``trajectory`` sees the wall."""
     from endotwin.synth import parse_trajectory
 
-    check_whole("seed", seed)
+    seed = check_whole("seed", seed)
     twin, poses = as_twin(twin), None
     if trajectory is not None:
         poses = parse_trajectory(trajectory, twin, seed, twin.camera, limits)
@@ -332,7 +345,7 @@ def preview(
     material: Iterable[str] | str = (),
     light: Iterable[str] | str = (),
     vary: Path | str | None = None,
-    camera: Path | str | None = None,
+    camera: Camera | Path | str | None = None,
     effects: Mapping[str, str] | None = None,
     motion: Iterable[str] | str = (),
     polyps: Iterable[str] | str = (),
@@ -351,12 +364,36 @@ def preview(
 
     varied = (material, light, vary, camera, effects)
     order = Order(trajectory, *varied, motion, polyps, fluids, "rgb", limits=limits, seed=seed)
-    return draw.preview(order.job(twin), out, overwrite)
+    return draw.preview(order.job(twin), as_path("picture", out), overwrite)
 
 
-def _check_frames(left_out: Iterable[int], sequence: Sequence) -> None:
-    for index in left_out:
+def _whole(config: object, part: str) -> Config:
+    """The config of that name or file, or itself where it is one; of a ``part``, ``fuse`` or ``fit``, one
+    that is the standard otherwise. Raises OptionError for anything else."""
+    if isinstance(config, str | os.PathLike):
+        return load_config(config)
+    kind = type(getattr(STANDARD, part))
+    if isinstance(config, kind):
+        return replace(STANDARD, **{part: config})
+    if not isinstance(config, Config):
+        raise OptionError(
+            f"the config is given by its name or file, or as an endotwin.config.{kind.__name__}, and not as "
+            f"{type(config).__name__}"
+        )
+    return config
+
+
+def _frames(left_out: Iterable[int] | int, sequence: Sequence) -> list[int]:
+    """The frames that are left out; raises OptionError where ``sequence`` has no such."""
+    try:
+        frames = [left_out] if isinstance(left_out, Real) else list(left_out)
+    except TypeError:
+        raise OptionError(
+            f"the frames to leave out are {left_out!r}, but must be indices of frames"
+        ) from None
+    for index in frames:
         if not isinstance(index, Integral) or not 0 <= index < len(sequence):
             raise OptionError(
                 f"{sequence.path} has no frame {index} to leave out: its frames are 0 to {len(sequence) - 1}"
             )
+    return frames

@@ -12,7 +12,9 @@ import tube_sequence
 import tube_twin
 
 import endotwin
-from endotwin.errors import EndotwinError, OptionError, TrajectoryError, TwinError
+from endotwin.cameras import write_camera
+from endotwin.config import FuseConfig, load_config
+from endotwin.errors import CameraError, EndotwinError, OptionError, TrajectoryError, TwinError
 from endotwin.surface.silhouettes import discontinuities
 
 
@@ -166,10 +168,12 @@ def test_labels_that_are_none_are_refused(twin, tmp_path, labels):
     [
         *({"seed": 1.5}, {"seed": -1}, {"labels": 3}, {"material": 3}, {"light": [1]}, {"motion": 3}),
         *({"workers": "x"}, {"workers": -1}, {"effects": ["noise"]}, {"effects": {"noise": "maybe"}}),
+        *({"polyps": {"Is": 6}}, {"limits": 3}, {"limits": {"unknown": 0.5}}, {"progress": 3}),
+        *({"vary": 3}, {"vary": {}}, {"scheduler": 3}),
     ],
 )
 def test_arguments_of_another_type_are_refused(twin, tmp_path, wrong):
-    with pytest.raises(OptionError, match="|".join([*wrong, "choice of an effect"])):
+    with pytest.raises(OptionError, match="|".join([*wrong, "choice of an effect", "file of ranges"])):
         endotwin.synthesize(twin, [tube_twin.pose(0.5)], tmp_path / "dataset", **wrong)
 
 
@@ -177,6 +181,10 @@ def test_arguments_of_another_type_end_no_fuse_or_fit_halfway(twin, made):
     for told, wrong in (
         ("scale", {"scale": "0.5"}),
         ("frame", {"without": 3.5}),
+        ("frames to leave out", {"without": None}),
+        ("progress", {"progress": 3}),
+        ("no config 'drafty'", {"config": "drafty"}),
+        ("FuseConfig, and not as dict", {"config": {"scale": 0.5}}),
         ("width and a height", {"undistort": 64}),
     ):
         with pytest.raises(OptionError, match=told):
@@ -186,9 +194,90 @@ def test_arguments_of_another_type_end_no_fuse_or_fit_halfway(twin, made):
         ("epochs", {"method": "endopbr", "epochs": 1.5}),
         ("gian=on", {"effects": {"gian": "on"}, "align": "off"}),
         ("gain=maybe", {"effects": {"gain": "maybe"}, "align": "off"}),
+        ("progress", {"progress": 3}),
+        ("checkpoint", {"checkpoint": 3}),
+        ("no config 'drafty'", {"config": "drafty"}),
+        ("FitConfig, and not as FuseConfig", {"config": FuseConfig()}),
     ):
         with pytest.raises(OptionError, match=told):
             endotwin.fit_twin(twin, **wrong)
+
+
+@pytest.mark.parametrize("no_path", [None, 3, True])
+@pytest.mark.parametrize(
+    "call",
+    [
+        lambda twin, path: twin.save(path),
+        lambda twin, path: twin.export(path),
+        lambda twin, path: endotwin.Twin.load(path),
+        lambda twin, path: endotwin.synthesize(twin, "jitter:frames=1", path),
+        lambda twin, path: endotwin.evaluate(twin, sheet=path or 0),
+        lambda twin, path: twin.show(path or 0),
+        lambda twin, path: endotwin.open_sequence(path),
+    ],
+)
+def test_what_is_no_path_is_refused(twin, call, no_path):
+    with pytest.raises(OptionError, match="is given by its path, and not as"):
+        call(twin, no_path)
+
+
+@pytest.mark.parametrize("no_camera", [3, 0, {"model": "pinhole"}])
+def test_what_is_no_camera_is_refused(twin, tmp_path, no_camera):
+    pose = tube_twin.pose(0.5)
+    for call in (
+        lambda: twin.render(pose, no_camera),
+        lambda: endotwin.Renderer(twin, no_camera),
+        lambda: endotwin.synthesize(twin, [pose], tmp_path / "dataset", camera=no_camera),
+    ):
+        with pytest.raises(CameraError, match="is no camera"):
+            call()
+
+
+@pytest.mark.parametrize("scale", ["1", None, np.nan])
+def test_what_is_no_scale_is_refused(twin, made, scale):
+    for call in (
+        lambda: endotwin.open_sequence(made / "tube", scale=scale),
+        lambda: twin.camera.scaled(scale),
+    ):
+        with pytest.raises(OptionError, match="the scale is"):
+            call()
+
+
+def test_a_dataset_may_be_seen_through_a_camera_that_is_no_file(twin, tmp_path):
+    camera, poses = twin.camera.scaled(0.5), [tube_twin.pose(0.5)]
+    write_camera(tmp_path / "camera.json", camera)
+    for name, given in {"object": camera, "file": tmp_path / "camera.json"}.items():
+        endotwin.synthesize(twin, poses, tmp_path / name, camera=given)
+    for file in (tmp_path / "file").iterdir():
+        assert (tmp_path / "object" / file.name).read_bytes() == file.read_bytes()
+
+
+def test_numbers_of_numpy_are_those_of_python(twin, made, tmp_path):
+    poses = [tube_twin.pose(0.5)]
+    for name, seed in (("numpy", np.int64(3)), ("python", 3)):
+        endotwin.synthesize(twin, poses, tmp_path / name, seed=seed, workers=np.int64(1))
+    assert (tmp_path / "numpy/dataset.json").read_bytes() == (tmp_path / "python/dataset.json").read_bytes()
+    endotwin.with_polyps(twin, "Is:size=3", seed=np.int64(1)).save(tmp_path / "grown")
+    for name, options in {
+        "scaled": {"scale": np.float32(0.5), "voxel_mm": np.float32(2), "without": np.array([1])},
+        "undistorted": {"undistort": tuple(np.array([32, 24]))},
+    }.items():
+        fused = endotwin.fuse_twin(made / "tube", **options)
+        fused.save(tmp_path / name)
+        assert endotwin.Twin.load(tmp_path / name).source == fused.source
+    fitted = endotwin.fit_twin(fused, seed=np.int64(1), budget_s=np.float32(1))
+    fitted.save(tmp_path / "fitted")
+
+
+def test_a_config_may_be_named_as_on_the_command_line(made, tmp_path):
+    (tmp_path / "own.yaml").write_text("fuse: {scale: 0.5}\nfit: {budget: 1s}\neffects: {vignetting: off}\n")
+    assert endotwin.fuse_twin(made / "tube", config="draft").record["fuse"]["config"]["frames"] == 24
+    fused = endotwin.fuse_twin(made / "tube", config=tmp_path / "own.yaml")
+    assert fused.source.scale == 0.5
+    fitted = endotwin.fit_twin(fused, config=str(tmp_path / "own.yaml"))
+    assert fitted.decisions["vignetting"].state == "off" and "align" not in fitted.record
+    whole = load_config(tmp_path / "own.yaml")
+    assert endotwin.fuse_twin(made / "tube", config=whole).source.scale == 0.5
 
 
 def test_a_view_is_from_one_pose(twin):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from dataclasses import MISSING, fields
 from math import isfinite
 from pathlib import Path
@@ -23,6 +24,7 @@ __all__ = [
     "Fisheye",
     "Omni",
     "Pinhole",
+    "as_camera",
     "camera_from_dict",
     "read_camera",
     "write_camera",
@@ -110,6 +112,16 @@ def read_camera(path: Path) -> Camera:
             f"{path} cannot be read as JSON ({error}); write it as {_example(Pinhole)}"
         ) from error
     return camera_from_dict(description, path)
+
+
+def as_camera(given: Camera | Path | str) -> Camera:
+    """``given`` itself, or the camera in the ``camera.json`` that it names. Raises CameraError where it is
+    neither."""
+    if isinstance(given, Camera):
+        return given
+    if isinstance(given, str | os.PathLike):
+        return read_camera(Path(given))
+    raise CameraError(f"{type(given).__name__} is no camera; give a twin's, any other, or a camera.json")
 
 
 def write_camera(path: Path, camera: Camera) -> None:

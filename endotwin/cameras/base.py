@@ -16,6 +16,7 @@ import numpy as np
 from numpy.polynomial import Polynomial
 
 from endotwin.errors import OptionError
+from endotwin.run.arguments import check_positive
 
 INVERSE_TABLE = 4096
 
@@ -85,7 +86,8 @@ def scaled_size(camera: Camera, scale: float) -> tuple[int, int, float, float]:
 
     Raises OptionError unless ``scale`` is positive and leaves at least one pixel.
     """
-    if not 0 < scale < np.inf or min(round(camera.width * scale), round(camera.height * scale)) < 1:
+    check_positive("scale", scale)
+    if min(round(camera.width * scale), round(camera.height * scale)) < 1:
         raise OptionError(
             f"A scale of {scale:g} leaves nothing of {camera.width}×{camera.height} pixels; choose 0.5, say"
         )

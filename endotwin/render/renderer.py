@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 import torch
 
-from endotwin.cameras import Camera
+from endotwin.cameras import Camera, as_camera
 from endotwin.errors import OptionError
 from endotwin.light.forward import Lit
 from endotwin.light.incidence import to_camera
@@ -120,7 +120,7 @@ class Renderer:
         twin = as_twin(twin)
         twin.require_fitted()
         self.twin = twin
-        self.camera = camera or twin.camera
+        self.camera = twin.camera if camera is None else as_camera(camera)
         self.caster = caster or Caster(twin.surface, threads)
         self._illumination = Illumination(twin, self.caster)
         self._exposure = np.asarray(exposure, np.float32)

@@ -21,6 +21,7 @@ from pathlib import Path
 
 from endotwin.errors import OutputError
 from endotwin.run import locks
+from endotwin.run.arguments import as_path
 from endotwin.run.exchange import exchanged
 
 TWIN, DATASET, TRADEOFF, STUDY = "twin.json", "dataset.json", "ladder.json", "study.json"
@@ -43,7 +44,7 @@ def check_free(path: Path, overwrite: bool, mark: str | None = None) -> None:
         mark: of a folder to be written, the file without which one that is there is not endotwin's to
             replace; None where ``path`` is to be a file.
     """
-    path = Path(path)
+    path = as_path("output", path)
     if path.exists():
         _check_own(path, mark)
         if not overwrite:
@@ -56,7 +57,7 @@ def check_free(path: Path, overwrite: bool, mark: str | None = None) -> None:
 
 def check_picture(path: Path, overwrite: bool) -> None:
     """``check_free`` of a picture, which must be named as a PNG file."""
-    if Path(path).suffix.lower() != ".png":
+    if as_path("picture", path).suffix.lower() != ".png":
         raise OutputError(f"{path} is not the name of a PNG picture; let it end in .png")
     check_free(path, overwrite)
 

@@ -16,11 +16,12 @@ import numpy as np
 from safetensors import SafetensorError
 from safetensors.numpy import load_file, save
 
-from endotwin.cameras import Camera, camera_from_dict
+from endotwin.cameras import Camera, as_camera, camera_from_dict
 from endotwin.effects import Decision, Effects
 from endotwin.errors import SequenceError, TwinError
 from endotwin.light.film import Film
 from endotwin.light.shading import F0_DIELECTRIC, respond
+from endotwin.run.arguments import as_path
 from endotwin.run.jsontext import parsed
 from endotwin.run.output import TWIN, write_folder
 from endotwin.sequence import Sequence, Split
@@ -308,9 +309,11 @@ class Twin:
             A view with the arrays ``color``, ``radiance``, ``depth_mm``, ``normals``, ``albedo``, ``mask``.
 
         Raises:
-            TwinError: the twin is not fitted. TrajectoryError: that is no rigid pose.
+            TwinError: the twin is not fitted. TrajectoryError: that is no rigid pose. CameraError: that is no
+                camera.
         """
-        return self._renderer.through(camera or self.camera).view(T_world_camera)
+        camera = self.camera if camera is None else as_camera(camera)
+        return self._renderer.through(camera).view(T_world_camera)
 
     @cached_property
     def _renderer(self) -> Renderer:
@@ -334,13 +337,13 @@ class Twin:
         """Write the twin for other programs, by the suffix of ``path`` (see ``endotwin.export.FORMATS``)."""
         from endotwin.export import export
 
-        export(self, path, overwrite)
+        export(self, as_path("export", path), overwrite)
 
     def show(self, screenshot: Path | None = None) -> None:
         """Open the inspector's window, or write its picture to ``screenshot``."""
         from endotwin.look.inspector import inspect
 
-        inspect(self, screenshot)
+        inspect(self, None if screenshot is None else as_path("screenshot", screenshot))
 
     def save(self, path: Path, overwrite: bool = False) -> None:
         """Write the twin folder, whole or not at all.
@@ -393,7 +396,7 @@ class Twin:
         Raises:
             TwinError: no twin there, a damaged one, or one of a newer version.
         """
-        path = Path(path)
+        path = as_path("twin", path)
         document = _read_document(path)
         try:
             _check_document(document)

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 
 from endotwin.errors import OptionError, SequenceError
-from endotwin.run.arguments import check_whole
+from endotwin.run.arguments import as_path, check_positive, check_whole
 from endotwin.sequence.readers import c3vd, simcol, transforms, tum
 from endotwin.sequence.sequence import Sequence
 from endotwin.sequence.undistorted import Undistorted
@@ -40,9 +39,7 @@ def open_sequence(
         CameraError: the camera is unknown or impossible.
         OptionError: there is no such format or scale.
     """
-    if not isinstance(path, str | os.PathLike):
-        raise OptionError(f"a sequence is given by its folder, and not as {type(path).__name__}")
-    path = Path(path)
+    path, scale = as_path("sequence", path), check_positive("scale", scale)
     if format is not None and format not in FORMATS:
         raise OptionError(f"There is no format {format!r}; choose one of {', '.join(FORMATS)}")
     if scale > 1:
@@ -61,11 +58,11 @@ def open_sequence(
     if undistort is not None:
         if not isinstance(undistort, tuple | list) or len(undistort) != 2:
             raise OptionError(f"a size to undistort to is a width and a height, and not {undistort!r}")
-        for name, size in zip(("width", "height"), undistort, strict=True):
-            check_whole(f"{name} to undistort to", size, 1)
+        named = zip(("width", "height"), undistort, strict=True)
+        size = [check_whole(f"{name} to undistort to", value, 1) for name, value in named]
         if scale != 1:
             raise OptionError("a size to undistort to is the size of the images; leave the scale out")
-        return Undistorted.of(sequence, *undistort)
+        return Undistorted.of(sequence, *size)
     if scale == 1:
         return sequence
     camera = sequence.camera.scaled(scale)

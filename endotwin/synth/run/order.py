@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from endotwin.cameras import read_camera
-from endotwin.run.arguments import check_whole, texts
+from endotwin.cameras import Camera, as_camera
+from endotwin.run.arguments import as_path, check_whole, texts
 from endotwin.synth.fluids import with_fluids
 from endotwin.synth.job import Job
 from endotwin.synth.labels import DEFAULT_LABELS, parse_labels
@@ -36,7 +36,7 @@ class Order:
     material: Iterable[str] | str = ()
     light: Iterable[str] | str = ()
     vary: Path | str | None = None
-    camera: Path | str | None = None
+    camera: Camera | Path | str | None = None
     effects: Mapping[str, str] | None = None
     motion: Iterable[str] | str = ()
     polyps: Iterable[str] | str = ()
@@ -50,26 +50,28 @@ class Order:
         """The job of rendering it from ``twin``; ``expected`` is told the pixels of all frames once they are
         known. Raises what ``endotwin.synthesize`` does."""
         twin = as_twin(twin)
-        lens = read_camera(Path(self.camera)) if self.camera else twin.camera
+        lens = twin.camera if self.camera is None else as_camera(self.camera)
         twin = equipped(twin, self.effects or {}, self.trajectory)
-        check_whole("seed", self.seed)
+        seed = check_whole("seed", self.seed)
         variation = self._variation(twin)
         labels = self._labels(twin)
-        poses = parse_trajectory(self.trajectory, twin, self.seed, lens, self.limits)
+        poses = parse_trajectory(self.trajectory, twin, seed, lens, self.limits)
         expected(len(poses) * lens.width * lens.height)
         for added, specs in ((with_polyps, self.polyps), (with_fluids, self.fluids)):
             if specs:
-                twin, weights = added(twin, specs, self.seed, poses, lens)
+                twin, weights = added(twin, specs, seed, poses, lens)
                 variation, poses = variation.carried(weights), kept_in(poses, twin, lens)
         motion = parse_motion(self.motion, twin)
         if motion:
             poses = motion.carried(poses)
-        return make_job(twin, poses, self.seed, labels, self.layout, lens, variation, motion)
+        return make_job(twin, poses, seed, labels, self.layout, lens, variation, motion)
 
     def _variation(self, twin: Twin) -> Variation:
         materials = [parse_material_edit(edit) for edit in texts("material", self.material)]
         always = fixed(materials, [parse_light_edit(edit) for edit in texts("light", self.light)])
-        return read_variation(Path(self.vary), twin, always) if self.vary else always
+        if self.vary is None:
+            return always
+        return read_variation(as_path("file of ranges", self.vary), twin, always)
 
     def _labels(self, twin: Twin) -> tuple[str, ...]:
         grows, wet = bool(self.polyps or twin.polyps), bool(self.fluids or twin.fluids)

@@ -11,7 +11,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from endotwin.cameras import Camera
-from endotwin.errors import EndotwinError, TrajectoryError
+from endotwin.errors import EndotwinError, OptionError, TrajectoryError
 from endotwin.run.streams import Stream
 from endotwin.sequence.poses import as_poses, frame_times, read_poses
 from endotwin.synth.trajectories.flight import MOST_FRAMES, FlightOptions, fly
@@ -98,7 +98,10 @@ def parse_trajectory(
         or
             no pose keeps the limits.
         SequenceError: the twin's sequence is needed, and that is gone.
+        OptionError: ``limits`` are none.
     """
+    if limits is not None and not isinstance(limits, Limits):
+        raise OptionError(f"the limits are {limits!r}, but must be an endotwin.synth.Limits")
     made_up = not isinstance(spec, str | os.PathLike)
     poses, spec = (as_poses(spec), "an array") if made_up else (None, os.fspath(spec))
     kind, _, text = spec.partition(":")
