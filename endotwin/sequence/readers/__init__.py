@@ -61,7 +61,10 @@ def open_sequence(
         named = zip(("width", "height"), undistort, strict=True)
         size = [check_whole(f"{name} to undistort to", value, 1) for name, value in named]
         if scale != 1:
-            raise OptionError("a size to undistort to is the size of the images; leave the scale out")
+            raise OptionError(
+                "a size to undistort to is the size of the images, at a scale of 1; leave the scale out, or "
+                "where a config has another, pass --scale 1 (in Python scale=1)"
+            )
         return Undistorted.of(sequence, *size)
     if scale == 1:
         return sequence
