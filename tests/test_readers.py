@@ -541,6 +541,8 @@ def test_depth_and_colour_of_different_size(tmp_path):
 def test_images_of_another_size_than_the_camera(tmp_path):
     folder = write_c3vd(tmp_path / "c3vd", camera={**CAMERA, "width": 128, "height": 96})
     refused(folder, "0000_color.png is 64×48", "128×96", "camera.json")
+    told = "frame_0.png is 64×48", "128×96", "of these images to transforms.json"
+    refused(write_transforms(tmp_path / "transforms", truth_poses(2), w=2 * W, h=2 * H), *told)
 
 
 def test_one_photo_of_another_size_than_the_others(tmp_path):

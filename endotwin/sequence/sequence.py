@@ -72,6 +72,7 @@ class Sequence:
         scale: factor on the image size, 1 = native.
         image_size: (width, height) of the files; the camera's own unless given.
         split: the frames that are used; None where the files say nothing of one: all are.
+        camera_file: name of the file that the camera is to be written to.
     """
 
     path: Path
@@ -85,6 +86,7 @@ class Sequence:
     scale: float = 1.0
     image_size: tuple[int, int] = (0, 0)
     split: Split | None = None
+    camera_file: str = "camera.json"
 
     def __post_init__(self) -> None:
         if self.image_size == (0, 0):
@@ -196,7 +198,9 @@ class Sequence:
     def _require_size(self, index: int, size: tuple[int, int]) -> None:
         if size != self.image_size:
             expected = f"{self.image_size[0]}×{self.image_size[1]}"
-            fault = f"the camera is {expected}; write size and intrinsics of these images to camera.json"
+            fault = (
+                f"the camera is {expected}; write size and intrinsics of these images to {self.camera_file}"
+            )
             if index > 0:
                 fault = f"the photos before it are {expected}; give it that size, or remove the frame"
             raise SequenceError(f"{self.color_files[index]} is {size[0]}×{size[1]}, but {fault}")

@@ -82,6 +82,7 @@ def read(path: Path) -> Sequence:
         read_depth_mm=partial(read_depth_mm, level_mm=every.level_mm, masks=_masks(every)),
         timestamps_s=frame_times(len(every.frames)),
         split=of_lists(every) if len(listings) == 1 else of_files(listings, every),
+        camera_file=" and ".join(each.file.name for each in listings),
     )
 
 
