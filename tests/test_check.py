@@ -25,6 +25,7 @@ from endotwin.check.views import read_views
 from endotwin.check.warp import disagreement
 from endotwin.effects.codec import Codec
 from endotwin.errors import SequenceError
+from endotwin.sequence import Sequence
 from endotwin.sequence.readers import open_sequence
 
 pytestmark = pytest.mark.slow
@@ -122,6 +123,19 @@ def test_half_a_pixel_is_measured_through_depth_noise(example, tmp_path):
     assert (np.abs(fine.step[[0, 1, 2]]) < 0.005).all() and abs(fine.step[6]) < 0.05
 
 
+def transforms_of(sequence: Sequence, matrices: np.ndarray) -> dict:
+    """The ``transforms.json`` of every second frame of ``sequence``, its poses ``matrices`` [N, 4, 4]."""
+    camera, frames = sequence.camera, zip(sequence.color_files[::2], sequence.depth_files[::2], strict=True)
+    return {
+        **{"w": camera.width, "h": camera.height, "fl_x": camera.fx, "fl_y": camera.fy, "unit": "mm"},
+        **{"cx": camera.cx + 0.5, "cy": camera.cy + 0.5, "depth_unit_scale_factor": 100 / 65535},
+        "frames": [
+            {"file_path": str(color), "depth_file_path": str(depth), "transform_matrix": matrix.tolist()}
+            for (color, depth), matrix in zip(frames, matrices, strict=True)
+        ],
+    }
+
+
 def test_matrices_of_a_transforms_json_written_transposed_or_as_opencv_are_named(example, tmp_path):
     sequence = open_sequence(example)
     T = sequence.T_world_camera[::2]
@@ -132,23 +146,12 @@ def test_matrices_of_a_transforms_json_written_transposed_or_as_opencv_are_named
         (np.linalg.inv(opengl), "poses_inverted"),
         (T, "poses_opengl"),
     ):
-        frames = [
-            {"file_path": str(color), "depth_file_path": str(depth), "transform_matrix": matrix.tolist()}
-            for color, depth, matrix in zip(
-                sequence.color_files[::2], sequence.depth_files[::2], matrices, strict=True
-            )
-        ]
-        camera = sequence.camera
-        content = {
-            **{"w": camera.width, "h": camera.height, "fl_x": camera.fx, "fl_y": camera.fy, "unit": "mm"},
-            **{"cx": camera.cx + 0.5, "cy": camera.cy + 0.5, "depth_unit_scale_factor": 100 / 65535},
-            "frames": frames,
-        }
+        content = transforms_of(sequence, matrices)
         (tmp_path / "transforms.json").write_text(json.dumps(content))
         assert named(tmp_path / "transforms.json") == ({kind} if kind else set())
     pair = tmp_path / "pair"
     pair.mkdir()
-    for name, chosen in (("train", frames[1:]), ("test", frames[:1])):
+    for name, chosen in (("train", content["frames"][1:]), ("test", content["frames"][:1])):
         turned = [
             {**frame, "transform_matrix": np.transpose(matrix).tolist()}
             for frame, matrix in zip(chosen, opengl[1:] if name == "train" else opengl[:1], strict=True)
@@ -158,6 +161,16 @@ def test_matrices_of_a_transforms_json_written_transposed_or_as_opencv_are_named
     assert (
         finding.kind == "poses_transposed" and "transforms_train.json and transforms_test" in finding.change
     )
+
+
+def test_depth_in_another_unit_is_mended_by_the_factor_in_a_transforms_json(example, tmp_path):
+    sequence = open_sequence(example)
+    content = transforms_of(sequence, sequence.T_world_camera[::2] @ np.diag([1.0, -1.0, -1.0, 1.0]))
+    content["depth_unit_scale_factor"] /= 1000
+    (tmp_path / "transforms.json").write_text(json.dumps(content))
+    (finding,) = check(tmp_path).findings
+    assert finding.kind == "depth_unit" and "the depth maps" in finding.file
+    assert "Multiply depth_unit_scale_factor in transforms.json by 1000" in finding.change
 
 
 def test_what_no_reading_mends_keeps_the_readers_own_sentence(example, tmp_path):

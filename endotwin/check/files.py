@@ -34,7 +34,7 @@ def files_of(sequence: Sequence) -> Files:
     depth = "the depth maps"
     if sequence.format == "transforms":
         file = " and ".join(file.name for file in transforms.files(Path(sequence.path)))
-        return Files(file, file, f"depth_unit_scale_factor in {file}", "m, or its 'unit'", "OpenGL")
+        return Files(file, file, f"{depth} (depth_unit_scale_factor in {file})", "m, or its 'unit'", "OpenGL")
     if sequence.format == "tum":
         return Files("groundtruth.txt", own or "calibration.txt", f"{depth} (5000 = 1 m)", "m")
     if sequence.format == "simcol":
