@@ -212,7 +212,8 @@ def test_arguments_of_another_type_end_no_fuse_or_fit_halfway(twin, made):
         lambda twin, path: endotwin.Twin.load(path),
         lambda twin, path: endotwin.synthesize(twin, "jitter:frames=1", path),
         lambda twin, path: endotwin.evaluate(twin, sheet=path or 0),
-        lambda twin, path: twin.show(path or 0),
+        lambda twin, path: endotwin.evaluate(twin, renders=path or 0),
+        lambda twin, path: endotwin.inspect(twin, screenshot=path or 0),
         lambda twin, path: endotwin.open_sequence(path),
     ],
 )

@@ -39,6 +39,7 @@ from endotwin.evaluation.renders import read_render, rendered_files
 from endotwin.evaluation.sheet import sheet_row
 from endotwin.light import shading
 from endotwin.render import Renderer
+from endotwin.run.arguments import as_path, check_progress
 from endotwin.run.output import check_picture
 from endotwin.sequence import Frame, Sequence
 from endotwin.sequence.images import write_png
@@ -370,19 +371,21 @@ def evaluate(
             ``lpips`` is no network of LPIPS, or is not installed.
         OutputError: ``sheet`` exists or cannot be written.
     """
+    renders = None if renders is None else as_path("folder of renders", renders)
     kept = sequence is None and renders is None and not isinstance(twin, Twin)
     folder = twin if kept else None
     twin = None if twin is None and renders is not None else as_twin(twin)
     if halves and renders is not None:
         raise OptionError("pictures of another method have no pose to fit; leave --halves or --renders out")
     lpips = _network(lpips)
+    check_progress(progress)
     if sheet is not None:
         check_picture(sheet, overwrite)
     sequence, indices = _to_be_scored(twin, sequence)
     if renders is None:
         show = _shown_by_twin(twin, sequence)
     else:
-        show = _shown_by_files(rendered_files(Path(renders), sequence, indices), sequence, twin)
+        show = _shown_by_files(rendered_files(renders, sequence, indices), sequence, twin)
     scene = Scene.of(Caster(twin.surface), sequence.camera, 0) if halves else None
     scores, rows = [], []
     for held_out in _compared(sequence, indices, show, progress):

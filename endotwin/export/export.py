@@ -7,6 +7,7 @@ from importlib import import_module
 from pathlib import Path
 
 from endotwin.errors import OptionError, TwinError
+from endotwin.run.arguments import as_path
 from endotwin.run.output import check_free
 from endotwin.twin import Twin, as_twin
 
@@ -31,7 +32,7 @@ def export(twin: Twin | Path | str, path: Path | str, overwrite: bool = False) -
         TwinError: the twin is not fitted, or has no triangle. OptionError: the suffix is none of FORMATS.
         OutputError: ``path`` exists, or cannot be written.
     """
-    path = Path(path)
+    path = as_path("export", path)
     check_export(path, overwrite)
     twin = as_twin(twin)
     twin.require_fitted()

@@ -19,6 +19,7 @@ from endotwin.cameras.perspective import height_degrees
 from endotwin.errors import EndotwinError, OptionError, TrajectoryError
 from endotwin.look.scope import Scope
 from endotwin.look.scopepane import PANES, ScopePane
+from endotwin.run.arguments import as_path
 from endotwin.run.output import check_picture, whole_file
 from endotwin.sequence.images import write_png
 from endotwin.sequence.poses import read_poses, write_c3vd_poses
@@ -138,12 +139,13 @@ def inspect(
         stage = Stage(twin, maps, off_screen=False, tile=size, panes=PANES if scope else None)
         stage.open_window(map if map in maps else next(iter(maps)), Path(keyframes), scope)
         return
-    check_picture(Path(screenshot), overwrite)
+    screenshot = as_path("screenshot", screenshot)
+    check_picture(screenshot, overwrite)
     if map == SCOPE:
-        write_png(Path(screenshot), Scope(twin).picture((TILE[0], 2 * TILE[1])), overwrite)
+        write_png(screenshot, Scope(twin).picture((TILE[0], 2 * TILE[1])), overwrite)
         return
     sheet = Stage(twin, maps, off_screen=True).contact_sheet([map] if map else list(maps))
-    write_png(Path(screenshot), sheet, overwrite)
+    write_png(screenshot, sheet, overwrite)
 
 
 def _screen() -> tuple[int, int] | None:

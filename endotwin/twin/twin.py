@@ -337,13 +337,13 @@ class Twin:
         """Write the twin for other programs, by the suffix of ``path`` (see ``endotwin.export.FORMATS``)."""
         from endotwin.export import export
 
-        export(self, as_path("export", path), overwrite)
+        export(self, path, overwrite)
 
     def show(self, screenshot: Path | None = None) -> None:
         """Open the inspector's window, or write its picture to ``screenshot``."""
         from endotwin.look.inspector import inspect
 
-        inspect(self, None if screenshot is None else as_path("screenshot", screenshot))
+        inspect(self, screenshot)
 
     def save(self, path: Path, overwrite: bool = False) -> None:
         """Write the twin folder, whole or not at all.
