@@ -36,7 +36,13 @@ def find(tmp_path_factory) -> Callable[[int, set[str]], tuple[Twin, dict]]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("seed", "effects"), [(12, {"gain"}), (13, {"profile"})], ids=["gain", "profile"])
+@pytest.mark.parametrize(
+    ("seed", "effects"),
+    [
+        pytest.param(12, {"gain"}, id="gain"),
+        pytest.param(13, {"profile"}, id="profile", marks=pytest.mark.long),
+    ],
+)
 def test_a_fit_finds_what_a_scene_has_and_nothing_else(find, seed: int, effects: set[str]) -> None:
     twin, made = find(seed, effects)
     assert {name for name in EFFECTS if twin.decisions[name].state == "on"} == effects

@@ -97,7 +97,9 @@ def moments(done: list[str], count: int) -> list[int]:
     return [telling[k] for k in np.unique(np.linspace(0, len(telling) - 1, count).astype(int))]
 
 
-@pytest.mark.parametrize("name", ALL)
+@pytest.mark.parametrize(
+    "name", [pytest.param(each, marks=[pytest.mark.long] * each.endswith("another")) for each in ALL]
+)
 def test_a_command_that_is_killed_leaves_old_or_new_and_the_next_sweeps(begun, tmp_path, monkeypatch, name):
     if "usdz" in ALL[name][1]:
         pytest.importorskip("pxr")

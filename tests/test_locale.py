@@ -29,6 +29,7 @@ def test_commands_spell_out_what_the_terminal_lacks_and_write_utf_8(made):
     assert "turned by up to 10°" in (made / "dataset" / "dataset.json").read_text(encoding="utf-8")
 
 
+@pytest.mark.long
 def test_a_sequence_whose_name_is_not_utf_8_becomes_a_twin_and_a_dataset(made, tmp_path):
     folder = os.fsdecode(b"k\xf6lon")
     shutil.copytree(made / "tube", tmp_path / folder)

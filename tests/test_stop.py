@@ -109,7 +109,7 @@ def test_selfcheck_stops_at_once_with_its_processes():
     assert not psutil.wait_procs(children, timeout=PATIENT_S)[1]
 
 
-@pytest.mark.parametrize("shards", [0, 1])
+@pytest.mark.parametrize("shards", [0, pytest.param(1, marks=pytest.mark.long)])
 def test_workers_that_render_say_nothing_and_what_is_done_is_kept(tmp_path, shards):
     tube_twin.fitted(tube_twin.seen(tube_twin.surface())).save(tmp_path / "twin")
     options = ["--trajectory", "centerline:frames=3000", "--workers", 2, "-o", tmp_path / "dataset"]

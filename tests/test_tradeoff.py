@@ -204,6 +204,7 @@ def made(tmp_path_factory) -> tuple[Path, list[dict], int]:
     return work / "out", rows, len(calls)
 
 
+@pytest.mark.long
 def test_a_stopped_run_goes_on_where_it_was(made):
     out, rows, calls = made
     assert calls == 3 and len(rows) == 2
@@ -214,6 +215,7 @@ def test_a_stopped_run_goes_on_where_it_was(made):
     }  # fmt: skip
 
 
+@pytest.mark.long
 def test_the_csv_holds_each_rung_with_its_stages_and_command(made):
     out, rows, _ = made
     with (out / "tradeoff.csv").open(encoding="utf-8") as file:
@@ -227,6 +229,7 @@ def test_the_csv_holds_each_rung_with_its_stages_and_command(made):
         assert line["commands"].startswith("endotwin fuse ")
 
 
+@pytest.mark.long
 def test_the_command_of_a_rung_names_a_config_that_is_that_rung(made):
     out, rows, _ = made
     for row, rung in zip(rows, ladder("steps=0,voxel=3+steps=0", "1s"), strict=True):
@@ -237,6 +240,7 @@ def test_the_command_of_a_rung_names_a_config_that_is_that_rung(made):
     assert out.name in " ".join(rows[0]["commands"][0])
 
 
+@pytest.mark.long
 def test_each_effect_has_its_line_beside_the_fit_that_decided_it(made):
     """One was forced on, in a tube that has none; what no fit needs is priced only."""
     out, _, _ = made
@@ -253,6 +257,7 @@ def test_each_effect_has_its_line_beside_the_fit_that_decided_it(made):
     assert all(f"<td>{effect}</td>" in page for effect in ("coat", *RENDERED))
 
 
+@pytest.mark.long
 def test_the_page_stands_alone_and_tells_every_rung(made):
     out, rows, _ = made
     page = (out / "tradeoff.html").read_text(encoding="utf-8")
@@ -266,6 +271,7 @@ def test_the_page_stands_alone_and_tells_every_rung(made):
         assert cv2.imread(str(picture)).std() > 1
 
 
+@pytest.mark.long
 def test_the_results_tell_the_scores_that_eval_gave(made):
     out, rows, _ = made
     for row in rows:
@@ -274,6 +280,7 @@ def test_the_results_tell_the_scores_that_eval_gave(made):
         assert sum(result["stages"].values()) == pytest.approx(result["seconds"], rel=0.02)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("options", "told"),
     [

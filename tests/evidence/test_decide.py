@@ -381,6 +381,7 @@ def test_no_light_is_likelier_that_no_endoscope_has(example):
     assert probe.compare(*odd).likelier == 0 < odd[0].unusual - odd[1].unusual
 
 
+@pytest.mark.long
 @needs_data
 def test_vignetting_and_guides_are_told_apart(lit_from_beside):
     twin, caster, samples, glints = lit_from_beside
