@@ -30,6 +30,9 @@ LEAST_CONTRAST = 0.1
 """Less is none: it changes values by 2.5 of 255 levels at most, and beside bounced light hues are known no
 better."""
 
+HINT = LEAST_CONTRAST / 2
+"""What hues have to ask for where light bounces, for all pixels to say whether there is a curve."""
+
 
 @dataclass(frozen=True)
 class Hues:
@@ -61,7 +64,7 @@ def judged(without: Callable[[Tone], Hues], wanted: str) -> tuple[Tone | None, D
     Where light bounces they have to call for one beside a bounce of any strength, too: what the bounce
     lacks turns hues as well, most of all where its strength is found too far off. Beside the bounce that was
     found without a curve, and has made up for one, they ask for too little; beside any, for too much: a fit
-    of all may begin halfway, and there is none where even these ask for none.
+    of all may begin halfway, and says whether there is one where they give a HINT.
 
     Args:
         without: the hues, by the curve that is taken off.
@@ -74,7 +77,8 @@ def judged(without: Callable[[Tone], Hues], wanted: str) -> tuple[Tone | None, D
         for curve, each in trials
     )
     least = min(tone.contrast, trials[-1][0].contrast)
-    sure = all(each.sigmas >= MIN_SIGMAS for _, each in trials) and least >= LEAST_CONTRAST
+    enough = LEAST_CONTRAST if len(trials) == 1 else HINT
+    sure = all(each.sigmas >= MIN_SIGMAS for _, each in trials) and least >= enough
     gain_db, took_s = round(verdict.gain_db, 3), round(time.perf_counter() - began, 3)
     if wanted == "auto" and not sure:
         return None, Decision("off", f"none that counts: {told}", gain_db, took_s)

@@ -202,8 +202,8 @@ class LightStage:
         could pass; then photos are believed as far as the model explains them."""
         number, near, best = 0, self._goes_on and self._pace.hurried, None
         while number < BOUNCE_STEPS and not self._late:
-            if near and (toned := self._newly_toned()) is not None:
-                return toned if self._pace.hurried else self._bent(toned)
+            if near and (toned := self._newly_bent()) is not None:
+                return toned
             if near and self._took_tone_back():
                 number, near, best = 0, False, None
             shared = self._judged(near)
@@ -235,14 +235,25 @@ class LightStage:
             self._take_best(self._better(best))
         return None
 
-    def _bent(self, toned: Toned) -> Toned:
+    def _newly_bent(self) -> Toned | None:
+        """As ``_newly_toned``, bent by all pixels, unless time is short: then what comes after bends it."""
+        toned = self._newly_toned()
+        return toned if toned is None or self._pace.hurried else self._bent(toned)
+
+    def _bent(self, toned: Toned) -> Toned | None:
         """A tone curve that hues tell of, as all pixels bend it in steps with light and materials until these
-        are near: what hues say beside what was found without it, that has made up for in part."""
+        are near: what hues say beside what was found without it, that has made up for in part. None where it
+        then is next to none; all is as it was."""
+        before = self._better(None)
         self._state = replace(self._state, shared=self._state.shared.under(toned[0]))
         for _ in range(BOUNCE_STEPS):
             if self._late or self._changed_by_less(self._step(joint=True), NEAR):
                 break
-        return self._state.shared.tone, toned[1]
+        tone = self._state.shared.tone
+        if not self._is_none(tone):
+            return tone, toned[1]
+        self._take_best(before)
+        return None
 
     def _changed_by_less(self, gain: float, share: float) -> bool:
         """Whether a step by which the cost fell by ``gain`` changed it by less than that share of it."""
@@ -329,13 +340,18 @@ class LightStage:
         if not shared.toned:
             return False
         tone = shared.tone if self._relighting.bounces else steadied(shared.tone, self._hues())
-        taken = tone.contrast < LEAST_CONTRAST and self._wanted["tone"] != "on"
-        if taken:
-            said = self._decisions["tone"]
-            reason = f"{said.reason}, but beside what was found without it none is asked for"
-            self._decisions["tone"] = replace(said, state="off", reason=reason)
+        taken = self._is_none(tone)
         self._state = replace(self._state, shared=shared.under(None if taken else tone))
         return taken
+
+    def _is_none(self, tone: Tone) -> bool:
+        """Whether a ``tone`` curve that nobody asked for is next to none, and with that off."""
+        if tone.contrast >= LEAST_CONTRAST or self._wanted["tone"] == "on":
+            return False
+        said = self._decisions["tone"]
+        reason = f"{said.reason}, but light and materials found with it leave {tone.contrast:.2f} of it"
+        self._decisions["tone"] = replace(said, state="off", reason=reason)
+        return True
 
     def _hues(self) -> Callable[[Tone], Hues]:
         within, material = self._within()

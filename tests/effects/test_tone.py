@@ -102,8 +102,9 @@ def test_a_bounce_of_another_strength_is_no_curve():
     assert judged(beside_a_bounce(0.0, strength=0.3), "auto")[0] is None
 
 
-def test_a_bounce_of_another_strength_makes_no_curve_of_a_faint_one():
-    assert judged(beside_a_bounce(0.07, strength=0.3, apart=0.6), "auto")[0] is None
+def test_a_bounce_of_another_strength_makes_no_curve_of_a_faint_one_and_half_of_the_least_is_a_hint():
+    assert judged(beside_a_bounce(0.03, strength=0.3, apart=0.6), "auto")[0] is None
+    assert judged(beside_a_bounce(0.07, strength=0.3, apart=0.6), "auto")[0] is not None
 
 
 @pytest.mark.parametrize(("found", "any_strength", "on"), [(0.09, 0.35, True), (0.34, 0.04, False)])
