@@ -4,7 +4,15 @@ import numpy as np
 import pytest
 
 from endotwin.errors import OptionError
-from endotwin.synth.variation.edits import edit_light, edit_materials, parse_light_edit, parse_material_edit
+from endotwin.fit.model import GAMMA
+from endotwin.fit.state import GLOBAL_RANGE
+from endotwin.synth.variation.edits import (
+    GAMMA_LEAST,
+    edit_light,
+    edit_materials,
+    parse_light_edit,
+    parse_material_edit,
+)
 from endotwin.twin import Light, Materials
 
 VALUES = np.array([0.0, 0.2, 0.5, 0.9], np.float32)
@@ -92,3 +100,7 @@ def test_a_light_that_cannot_be_is_refused_and_an_offset_may_be_negative():
 def test_a_light_edit_that_is_not_understood_is_refused_with_what_is_allowed(text):
     with pytest.raises(OptionError, match=r"intensity, n, q"):
         parse_light_edit(text)
+
+
+def test_the_least_gamma_of_an_edit_is_that_of_a_fit():
+    assert GLOBAL_RANGE[GAMMA][0] == GAMMA_LEAST

@@ -121,8 +121,9 @@ def _depth_unit_finding(scale: float, depth_mm: float, format: str, files: Files
         near = min(LEVELS_PER_MM, key=lambda known: abs(np.log(levels / known)))
         if abs(np.log(levels / near)) < 0.03:
             says += f" They hold {LEVELS_PER_MM[near]}, while 65535 stands for 100 mm in this layout."
-    change = f"Multiply the depth by {1 / scale:.5g} and write it again: {files.depth}."
-    if format == "transforms":
+    if format != "transforms":
+        change = f"Multiply the depth by {1 / scale:.5g} and write it again: {files.depth}."
+    else:
         change = (
             f"Multiply depth_unit_scale_factor in {files.poses} by {1 / scale:.5g}; where the file has none, "
             "it is 0.001, and 1 for OpenEXR."

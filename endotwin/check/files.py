@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from endotwin.sequence import Sequence
-from endotwin.sequence.readers import transforms
 
 
 @dataclass(frozen=True)
@@ -33,7 +32,7 @@ def files_of(sequence: Sequence) -> Files:
     own = "camera.json" if (folder / "camera.json").is_file() else ""
     depth = "the depth maps"
     if sequence.format == "transforms":
-        file = " and ".join(file.name for file in transforms.files(Path(sequence.path)))
+        file = sequence.camera_file
         return Files(file, file, f"{depth} (depth_unit_scale_factor in {file})", "m, or its 'unit'", "OpenGL")
     if sequence.format == "tum":
         return Files("groundtruth.txt", own or "calibration.txt", f"{depth} (5000 = 1 m)", "m")

@@ -11,7 +11,7 @@ from PIL import Image
 from scipy.fft import dctn
 
 from endotwin.effects.luma import LUMA
-from endotwin.sequence.images import read_color
+from endotwin.sequence.images import read_color, unclipped
 
 BLOCK = 8
 
@@ -71,7 +71,8 @@ def _coefficients(photo: np.ndarray) -> np.ndarray:
     down, across = (size // BLOCK for size in photo.shape[:2])
     whole = photo[: down * BLOCK, : across * BLOCK].reshape(down, BLOCK, across, BLOCK, 3)
     blocks = whole.transpose(0, 2, 1, 3, 4).reshape(-1, BLOCK, BLOCK, 3)
-    blocks = blocks[(blocks.min(axis=(1, 2, 3)) > 0) & (blocks.max(axis=(1, 2, 3)) < 255)]
+    usable = unclipped(photo)[: down * BLOCK, : across * BLOCK].reshape(down, BLOCK, across, BLOCK)
+    blocks = blocks[usable.all(axis=(1, 3)).ravel()]
     found = dctn(blocks @ LUMA.astype(float), axes=(1, 2), norm="ortho").reshape(-1, BLOCK**2)
     return found[np.unique(found[:, 1:].round(DECIMALS), axis=0, return_index=True)[1]]
 

@@ -250,7 +250,7 @@ class LightStage:
             if self._late or self._changed_by_less(self._step(joint=True), NEAR):
                 break
         tone = self._state.shared.tone
-        if not self._is_none(tone):
+        if not self._called_off(tone):
             return tone, toned[1]
         self._take_best(before)
         return None
@@ -340,12 +340,12 @@ class LightStage:
         if not shared.toned:
             return False
         tone = shared.tone if self._relighting.bounces else steadied(shared.tone, self._hues())
-        taken = self._is_none(tone)
+        taken = self._called_off(tone)
         self._state = replace(self._state, shared=shared.under(None if taken else tone))
         return taken
 
-    def _is_none(self, tone: Tone) -> bool:
-        """Whether a ``tone`` curve that nobody asked for is next to none, and with that off."""
+    def _called_off(self, tone: Tone) -> bool:
+        """Call a ``tone`` curve off that nobody asked for, if it is next to none; whether it was."""
         if tone.contrast >= LEAST_CONTRAST or self._wanted["tone"] == "on":
             return False
         said = self._decisions["tone"]

@@ -36,9 +36,9 @@ class Globals:
     for.
 
     Without ``specular`` there is no specular lobe, and ln f0 stays where it is. A ``coat`` adds a lobe of its
-    own; a lens that ``vignettes`` adds a parameter, and so does a tone curve, which what x^γ displays is
-    ``toned`` by. ``tissue`` [3] is the mean of ln of the base colours that bounced light follows; None: what
-    it was when that was found.
+    own; a lens that ``vignettes`` adds a parameter, and so does a tone curve over x^γ, by which photos are
+    ``toned``. ``tissue`` [3] is the mean of ln of the base colours that bounced light follows; None: what it
+    was when that was found.
     """
 
     vector: Tensor

@@ -110,7 +110,8 @@ def fuse(
             f"A voxel of {voxel_mm:g} mm needs more than 2 GB of memory; choose {least_mm:.2g} or more."
         )
     origin_mm = np.median(np.asarray(sequence.T_world_camera, np.float64)[frames, :3, 3], axis=0)
-    coarse_mm, faces = COARSE_VOXELS * finest_mm, split(camera)
+    coarse_mm = COARSE_VOXELS * finest_mm
+    faces = split(camera)
     coarse = fuse_tsdf(faces, views("noise", sample), origin_mm, coarse_mm, noise_mm=0.0)
     noise = measured_noise(camera, surface_of(origin_mm, *coarse), views("noise", sample))
     if voxel_mm is None:

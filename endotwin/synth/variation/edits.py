@@ -28,7 +28,8 @@ OFFSETS = ("offset.x", "offset.y", "offset.z")
 """Places of the light guides in the camera frame, mm; 0 where the light is at the lens."""
 
 RESPONSES = ("gamma", "gain")
-"""γ of the camera response, and a factor on the radiance before it, 1 unless edited; the least is 0."""
+"""γ of the camera response, at least GAMMA_LEAST, and a factor on the radiance before it, 1 unless edited, at
+least 0."""
 
 GAMMA_LEAST = 0.15
 """The least γ that a fit finds; less shows nearly every radiance alike."""

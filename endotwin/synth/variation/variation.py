@@ -249,7 +249,7 @@ def _effects(entries: object, twin: Twin, path: Path) -> dict[str, float]:
     chances = {}
     _require_mapping(entries or {}, EFFECTS, f"{path}, effects")
     for name, chance in (entries or {}).items():
-        chance = {"on": True, "off": False}[chance] if chance in ("on", "off") else chance
+        chance = chance == "on" if chance in ("on", "off") else chance
         if not isinstance(chance, int | float) or not 0 <= chance <= 1:
             raise OptionError(
                 f"{path}: effect {name!r} is {chance!r}; write on, off, or a chance from 0 to 1"
