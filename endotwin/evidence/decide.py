@@ -215,8 +215,19 @@ class _Trial:
 
     def _fitted_with(self, name: str, kept: Fitted) -> Fitted:
         """``kept`` with profile or vignetting beside it."""
-        other = self._mixed(kept) if name == "profile" else replace(kept.hypothesis, vignetting=True)
-        return self._probe.fit(other)
+        if name == "profile":
+            return self._profiled(kept)
+        return self._probe.fit(replace(kept.hypothesis, vignetting=True))
+
+    def _profiled(self, kept: Fitted) -> Fitted:
+        """``kept`` with a profile: where its guides are, or where they move beside an exponential one, which
+        guides that were found without it may have made up for."""
+        here = self._probe.fit(self._mixed(kept))
+        if kept.hypothesis.guides_mm == AT_LENS:
+            return here
+        moved = settled(self._ground, self._probe.fit(replace(kept.hypothesis, profile=EXPONENTIAL)))
+        moved = self._probe.fit(self._mixed(moved))
+        return moved if self._probe.compare(here, moved).gain_db > 0 else here
 
     def _verdict_beside(self, name: str, kept: Fitted, other: Fitted) -> Verdict:
         """On ``other``, which has the effect ``name`` as well. No endoscope's lens brightens the rim."""

@@ -51,6 +51,10 @@ LEAST_RATE = 1e-6
 
 MOST_GUIDES = 3
 
+WORTH = 3.0
+"""So many places of the tissue say as much of where a guide stands as all of its glints do: normals and lobes
+err alike in these, and throw them all to one side of it."""
+
 PLAIN, LEAST_GLINTS = 4.0, 100
 """Guides that leave so many times less of so many glints than light at the lens does are told by them.
 Normals that err alike in many places pass for guides, too, but on random scenes left 39 % at least."""
@@ -89,14 +93,14 @@ class Glints:
             return np.zeros((0, 3))
         return np.c_[self._best(number)[0], np.zeros(number)]
 
-    def residuals(self, guides_mm: np.ndarray, pixels: int) -> np.ndarray:
-        """Residuals [C²] of the number of glints among so many ``pixels`` under guides at ``guides_mm``
-        [K, 3], about which they spread as about the best K."""
+    def residuals(self, guides_mm: np.ndarray, place_pixels: float) -> np.ndarray:
+        """Residuals [C²] of the number of glints under guides at ``guides_mm`` [K, 3], about which they
+        spread as about the best K; beside those of pixels, of which a place of the tissue has so many."""
         if not self.shone.any():
             return np.zeros(self.shone.size)
         _, spread_mm, rates = self._best(len(guides_mm))
-        share = min(1.0, pixels / self.seen.sum())
-        return np.sqrt(share) * self._residuals(np.asarray(guides_mm)[:, :2], spread_mm, rates)
+        weight = min(1.0, WORTH * len(guides_mm) * place_pixels / self.shone.sum())
+        return np.sqrt(weight) * self._residuals(np.asarray(guides_mm)[:, :2], spread_mm, rates)
 
     def told(self) -> int:
         """The least number of guides that glints plainly tell of; 0: of none."""

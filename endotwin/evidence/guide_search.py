@@ -270,8 +270,8 @@ class Search:
         return self._probe.linearised(self._with(guides_mm), self._base, self._ground.visible(guides_mm))
 
     def _glints(self, guides_mm: np.ndarray) -> np.ndarray:
-        """Residuals of the glints among as many pixels."""
-        return self._ground.glints.residuals(guides_mm, len(self._probe))
+        """Residuals of the glints."""
+        return self._ground.glints.residuals(guides_mm, len(self._probe) / self._probe.count)
 
     def _with(self, guides_mm: np.ndarray) -> Hypothesis:
         return replace(self._base.hypothesis, guides_mm=_plain(guides_mm), shadows=True)

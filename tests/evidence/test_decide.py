@@ -222,6 +222,16 @@ def test_guides_two_millimetres_from_the_lens_are_found_where_no_light_bounces(t
         assert apart_mm.min() < 0.7
 
 
+@pytest.mark.long
+def test_a_guide_that_stands_elsewhere_beside_the_profile_it_has_is_found_there(tmp_path):
+    """Beside a cosine the light of an exponential profile seems to come from 2.5 mm farther out."""
+    made = make(Scene.draw(1700), tmp_path)
+    decided = decide(*reordered(scene(tmp_path, 1.0)), {})
+    assert {"offset", "profile"} <= set(decided.effects)
+    assert decided.effects["profile"].exponential == pytest.approx(1, abs=0.1)
+    np.testing.assert_allclose(decided.effects["offset"].guides_mm, made["guides_mm"], atol=0.3)
+
+
 @pytest.fixture(scope="module")
 def lit_from_beside():
     return scene(DATA / "colon_offset", 0.5)

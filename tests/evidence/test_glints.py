@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from scenes import pinhole
 from scipy.spatial.transform import Rotation
 
-from endotwin.evidence.glints import Glints, crossings_mm, outshining
+from endotwin.evidence.glints import WORTH, Glints, crossings_mm, outshining
 from endotwin.pixels.samples import Samples, Views
 from endotwin.pixels.start import Start
 from endotwin.surface import Surface
@@ -85,21 +85,34 @@ def test_half_the_squares_of_the_residuals_are_negative_log_likelihoods():
         told = glints.seen > 0
         return float((mean - glints.shone * np.log(np.where(told, mean, 1))).sum())
 
-    def half_squares(guides_mm: np.ndarray, pixels: float) -> float:
-        return float((glints.residuals(guides_mm, pixels) ** 2).sum()) / 2
+    def half_squares(guides_mm: np.ndarray, place_pixels: float) -> float:
+        return float((glints.residuals(guides_mm, place_pixels) ** 2).sum()) / 2
 
-    aside_mm, every = THREE_MM + np.array([0.4, -0.3, 0]), glints.seen.sum()
+    aside_mm, every = THREE_MM + np.array([0.4, -0.3, 0]), glints.shone.sum()
     lost = negative_log_likelihood(aside_mm) - negative_log_likelihood(THREE_MM)
     assert lost > 0
     assert half_squares(aside_mm, every) - half_squares(THREE_MM, every) == pytest.approx(lost)
-    some = half_squares(aside_mm, every / 8) - half_squares(THREE_MM, every / 8)
-    assert some == pytest.approx(lost / 8)
+    worth = 3 * WORTH * 8 / every
+    assert half_squares(aside_mm, 8) - half_squares(THREE_MM, 8) == pytest.approx(worth * lost)
+
+
+@pytest.mark.parametrize("number", [1, 3])
+def test_glints_say_no_more_of_a_guide_however_many_they_are(number):
+    true_mm = THREE_MM[:number]
+    few, many = (drawn(true_mm, 0), drawn(true_mm, 0))
+    many.shone, many.seen = 16 * many.shone, 16 * many.seen
+    aside_mm = true_mm + np.array([0.4, -0.3, 0])
+    lost = [
+        (glints.residuals(aside_mm, 8) ** 2).sum() - (glints.residuals(true_mm, 8) ** 2).sum()
+        for glints in (few, many)
+    ]
+    assert lost[1] == pytest.approx(lost[0], rel=0.02)
 
 
 def test_where_nothing_glints_nothing_is_said_of_guides():
     glints = Glints(X_MM, np.zeros((CELLS, CELLS)), np.ones((CELLS, CELLS)))
     assert glints.guides_mm(2).shape == (0, 3)
-    assert not glints.residuals(THREE_MM, 1000).any()
+    assert not glints.residuals(THREE_MM, 8.0).any()
 
 
 def test_a_pixel_glints_that_outshines_its_place_in_other_photos_however_near_they_were_taken():
