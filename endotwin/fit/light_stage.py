@@ -49,6 +49,9 @@ BOUNCE_HELD = ("q", "L0")
 """Where light bounces, q stays where the fit starts, at the inverse square of a small light: what the bounce
 off a mesh errs by would bend it, and γ with it. L0 is told by the albedo's scale."""
 
+MOVES, AT_REST = 3, 2e-3
+"""Guides are moved so often, unless they come to rest: within this share of the median viewing distance."""
+
 LEAVING = 2
 """Steps in which light learns to do without what is faint, before the materials do."""
 
@@ -147,6 +150,7 @@ class LightStage:
         if tone is not None:
             self._decisions["tone"] = decision
         self._unit_mm = unit_mm(surface)
+        self._moves = MOVES if relighting.effects.guides_mm else 0
         self._goes_on = before is not None and before.state.shared.bounces and relighting.bounces
         if relighting.bounces and not self._goes_on and not pace.hurried:
             n = likeliest_n(samples, surface, start, relighting, BOUNCE_HELD, tone)
@@ -187,12 +191,13 @@ class LightStage:
                 return toned
             if ready and self._took_tone_back():
                 number = 0
-            shared = self._judged(ready)
+            shared = self._guided(self._judged(ready))
             self._renew(shared, self._undetermined, self._noise)
             if late:
                 break
             gain = self._step(joint=False)
-            number = self._next(number, STEPS, COAT_STEP, self._changed_by_less(gain, CONVERGED))
+            near = self._changed_by_less(gain, CONVERGED) and not self._moves
+            number = self._next(number, STEPS, COAT_STEP, near)
         self._without_faint()
         return None
 
@@ -225,10 +230,12 @@ class LightStage:
             if near and self._bare is None:
                 self._solver.learn_error(self._state)
                 best = self._better(best)
+                self._state = replace(self._state, shared=self._guided(self._state.shared))
             if tried:
                 self._choose_lobe()
             steady = self._changed_by_less(gain, CONVERGED) or _steady(shared, self._state.shared)
-            number = self._next(number, BOUNCE_STEPS, number + 1, steady and not holding)
+            steady &= not (holding or self._moves)
+            number = self._next(number, BOUNCE_STEPS, number + 1, steady)
             near = near or number >= LATEST or (self._changed_by_less(gain, NEAR) and not holding)
         self._leave_worse_coat()
         if best is not None:
@@ -287,6 +294,24 @@ class LightStage:
             return
         relighting.vary(self._solver, found)
         self._take(found)
+
+    def _guided(self, shared: Globals) -> Globals:
+        """Light and response with guides moved to where, shadows included, they explain best what varies
+        within vertices, unless they are at rest: the probe that had found them knew of no coat, and less of
+        the bounce."""
+        if not self._moves or self._late:
+            return shared
+        relighting, held = self._relighting, self._undetermined
+        if relighting.bounces:
+            held = (*held, *BOUNCE_HELD, "albedo scale")
+        within, material = self._within()
+        found = within.guided(material, shared, held, self._noise, relighting.moving)
+        if np.abs(found.aside_mm).max() < AT_REST * within.samples.distance_mm:
+            self._moves = 0
+            return shared
+        self._moves -= 1
+        relighting.move_guides(self._solver, found.aside_mm, self._state)
+        return found.shared
 
     @property
     def _late(self) -> bool:

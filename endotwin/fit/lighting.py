@@ -78,15 +78,21 @@ def _visible(samples: Samples, caster: Caster, guides_mm: np.ndarray) -> np.ndar
     return np.stack(seen, axis=1)
 
 
-def guides_aside(samples: Samples, surface: Surface, effects: Effects, step_mm: float) -> Iterator[Samples]:
-    """``samples`` lit by each guide moved by ``step_mm`` along x, then along y and z; without shadows."""
+def guides_aside(
+    samples: Samples, surface: Surface, caster: Caster, effects: Effects, step_mm: float
+) -> Iterator[Samples]:
+    """``samples`` lit by each guide moved by ``step_mm`` along x, then along y and z."""
     guides_mm = np.asarray(effects.guides_mm, np.float32)
+    visible = _visible(samples, caster, guides_mm) if "shadows" in effects else None
     normals, points_mm = samples.normals(surface), samples.points_mm
     for k in range(len(guides_mm)):
         for axis in range(3):
             moved_mm = guides_mm.copy()
             moved_mm[k, axis] += step_mm
-            yield replace(samples, guides=guided(points_mm, normals, moved_mm, effects.profile))
+            seen = None if visible is None else visible.copy()
+            if seen is not None:
+                seen[:, k] = _visible(samples, caster, moved_mm[k : k + 1])[:, 0]
+            yield replace(samples, guides=guided(points_mm, normals, moved_mm, effects.profile, seen))
 
 
 class Relighting:
@@ -115,34 +121,44 @@ class Relighting:
 
     @property
     def varied(self) -> Varied:
-        """What the light's steps may change beside light and response. Guides that cast shadows stay: by
-        these the probe has found them better than shading can."""
-        frames = len(self.effects["gain"].frames) if "gain" in self.effects else 0
-        if self.effects.guides_mm is None or "shadows" in self.effects:
-            return Varied(frames, faint=self.faint)
+        """What the light's steps may change beside light and response."""
+        return Varied(len(self.effects["gain"].frames) if "gain" in self.effects else 0, self.faint)
+
+    @property
+    def moving(self) -> Varied:
+        """What changes while guides beside the lens move."""
 
         def aside(samples: Samples, step_mm: float) -> Iterator[Samples]:
-            return guides_aside(samples, self._surface, self.effects, step_mm)
+            return guides_aside(samples, self._surface, self._caster, self.effects, step_mm)
 
-        return Varied(frames, aside, len(self.effects.guides_mm), self.faint)
+        return replace(self.varied, faint=NOTHING, guides=len(self.effects.guides_mm), aside=aside)
 
     def vary(self, solver: GaussNewton, found: Renewed) -> None:
-        """Gains, guides and faint effects as a step has ``found`` them, and the samples of ``solver`` lit
-        so."""
-        samples = solver.samples
+        """Gains and faint effects as a step has ``found`` them, and the samples of ``solver`` lit so."""
         if len(found.log_gain):
             self.effects = _brightened(self.effects, found.log_gain)
         if found.faint.any():
             self.faint = self.faint.with_more(found.faint)
         if len(found.log_gain) or found.faint.any():
-            samples = self.exposed(samples)
-        if len(found.aside_mm):
-            guides_mm = np.asarray(self.effects.guides_mm) + found.aside_mm
-            guides_mm[:, 2] = np.minimum(guides_mm[:, 2], 0)
-            self.effects = self.effects.including(Offset(tuple(map(tuple, guides_mm.tolist()))))
-            samples = replace(samples, guides=_guided(samples, self._surface, self._caster, self.effects))
-        if samples is not solver.samples:
-            solver.relight(samples)
+            solver.relight(self.exposed(solver.samples))
+
+    def move_guides(self, solver: GaussNewton, aside_mm: np.ndarray, state: State) -> None:
+        """The guides moved by ``aside_mm`` [K, 3], none before the lens, and the samples of ``solver`` lit
+        so."""
+        guides_mm = np.asarray(self.effects.guides_mm) + aside_mm
+        guides_mm[:, 2] = np.minimum(guides_mm[:, 2], 0)
+        self._take(self.effects.including(Offset(tuple(map(tuple, guides_mm.tolist())))), solver)
+        self(solver, state)
+
+    def _take(self, effects: Effects, solver: GaussNewton) -> None:
+        """``effects`` from here on, and the samples of ``solver`` as their guides light them."""
+        moved, self.effects = effects.guides_mm != self.effects.guides_mm, effects
+        if moved:
+            samples = solver.samples
+            guides = _guided(samples, self._surface, self._caster, effects)
+            solver.relight(replace(samples, guides=guides))
+        if moved and self.bounces:
+            self._bouncer.light_from(effects)
 
     def brighten(self, solver: GaussNewton, log_gain: np.ndarray) -> None:
         """Frames brighter by ``log_gain`` [F], or as they are by [0], and the samples of ``solver`` so."""
@@ -151,8 +167,9 @@ class Relighting:
             solver.relight(self.exposed(solver.samples))
 
     def expose(self, solver: GaussNewton, effects: Effects) -> None:
-        """The samples of ``solver`` exposed with ``effects``, which hold from here on, and nothing faint."""
-        self.effects, self.faint = effects, NOTHING
+        """The samples of ``solver`` under ``effects``, which hold from here on, and nothing faint."""
+        self._take(effects, solver)
+        self.faint = NOTHING
         solver.relight(self.exposed(solver.samples))
 
     def exposed(self, samples: Samples) -> Samples:
@@ -220,8 +237,13 @@ class Bouncer:
         self._surface, self.light_stays = surface, False
         self._placed: tuple[Tensor | None, Places | None] = None, None
         self._radiosity = Radiosity(surface, caster, effects["interreflection"].cell_mm)
+        self._poses = views.T_local_camera
+        self.light_from(effects)
+
+    def light_from(self, effects: Effects) -> None:
+        """From here on the guides of ``effects`` throw the light that bounces."""
         guides_mm = effects.guides_mm or AT_LENS
-        self._light = BouncedLight(self._radiosity, views.T_local_camera, guides_mm, effects.profile)
+        self._light = BouncedLight(self._radiosity, self._poses, guides_mm, effects.profile)
 
     def bounced(
         self, samples: Samples, roughness: Tensor, materials: Tensor, triangles: Tensor, shared: Globals

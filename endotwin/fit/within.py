@@ -66,8 +66,12 @@ says that it is 0, and none is found that light and response nearly pass for."""
 
 REWEIGHTS = 4
 
-ASIDE = 0.005
-"""Guides are moved by this share of the median viewing distance to find what their places change."""
+GUIDE_PIXELS = 60_000
+"""Of those that tell where guides stand, all of some vertices."""
+
+ASIDE = 0.01
+"""Guides are moved to either side by this share of the median viewing distance to find what their places
+change: with less, shadows that jump from pixel to pixel hide it."""
 
 ASIDE_SPREAD = 0.02
 """Standard deviation of a step of theirs, as a share of that distance: what the probe leaves open."""
@@ -79,16 +83,16 @@ class Varied:
 
     Attributes:
         frames: how many frames have gains of their own, one after the other as in the samples' views.
-        aside: samples, and mm, to the same ones lit by guides moved so far: each in turn, along x, then
-            y and z; None: they stay, or the light is at the lens.
-        guides: how many there are.
         faint: effects that may be there.
+        guides: how many may move.
+        aside: samples, and mm, to the same ones lit by guides moved so far: each in turn, along x, then
+            y and z.
     """
 
     frames: int = 0
-    aside: Callable[[Samples, float], Iterator[Samples]] | None = None
-    guides: int = 0
     faint: Faint = NOTHING
+    guides: int = 0
+    aside: Callable[[Samples, float], Iterator[Samples]] | None = None
 
 
 STILL = Varied()
@@ -165,6 +169,17 @@ class Within:
             return found
         shone = self.shone(material, found.shared, noise)
         return replace(found, shared=shone.shared, roughness=shone.roughness)
+
+    def guided(
+        self, material: Tensor, shared: Globals, held: tuple[str, ...], noise: float, varied: Varied
+    ) -> Renewed:
+        """A Gauss–Newton step of light, response and guides, which are among what is ``varied``, by what is
+        off the highlights of some vertices. Arguments as in ``renewed``."""
+        rows = torch.from_numpy(self.vertex % max(1, len(self.samples) // GUIDE_PIXELS) == 0)
+        some = replace(self, samples=self.samples[rows], vertex=self.vertex[rows.numpy()])
+        diffuse = some.samples.sin2 > DIFFUSE_SIN2
+        held = (*held, "level", "f0", "k2", "contrast")
+        return some._step(material[rows], shared, held, diffuse, noise, varied)
 
     def shone(self, material: Tensor, shared: Globals, noise: float) -> Renewed:
         """A step of f0 and, where there is a coat, of it and of roughness, which pass for one another.
@@ -319,9 +334,7 @@ class Within:
         by_coat = np.zeros(len(predicted))
         if model.by_coat is not None:
             by_coat = (model.by_coat[bright] * tells).mean(dim=1).numpy() / predicted
-        by_guides = (
-            self._by_guides(rows, material, shared, varied, model.predicted[bright], tells) / predicted
-        )
+        by_guides = self._by_guides(rows, material, shared, varied, tells) / predicted
         shapes = varied.faint.shapes(self.samples)[rows.numpy()].T
         by_faint = shared.gamma * slopes[:, LEVEL] * shapes
         by_raw = roughness_slope(material[rows, 3])[:, None]
@@ -349,20 +362,15 @@ class Within:
         return [place >> 32, (place & 0xFFFFFFFF).astype(np.int32), *means, weight]
 
     def _by_guides(
-        self,
-        rows: Tensor,
-        material: Tensor,
-        shared: Globals,
-        varied: Varied,
-        predicted: Tensor,
-        tells: Tensor,
+        self, rows: Tensor, material: Tensor, shared: Globals, varied: Varied, tells: Tensor
     ) -> np.ndarray:
-        """Slopes [3K, R] of the mean display values of samples ``rows`` by the guides' places, 1/mm; by the
-        channels, of those ``predicted`` [R, 3], of which the photo ``tells`` [R, 3]."""
+        """Slopes [3K, R] of the mean display values of samples ``rows`` by the guides' places, 1/mm; of the
+        channels of which the photo ``tells`` [R, 3]."""
         slopes = np.zeros((3 * varied.guides, len(rows)))
         if varied.guides:
-            step_mm, material = ASIDE * self.samples.distance_mm, material[rows]
-            for slope, moved in zip(slopes, varied.aside(self.samples[rows], step_mm), strict=True):
-                change = (predict(moved, material, shared) - predicted) * tells
-                slope[:] = change.mean(dim=1).numpy() / step_mm
+            samples, material, step_mm = self.samples[rows], material[rows], ASIDE * self.samples.distance_mm
+            moved = (varied.aside(samples, step_mm), varied.aside(samples, -step_mm))
+            for slope, more, less in zip(slopes, *moved, strict=True):
+                change = predict(more, material, shared) - predict(less, material, shared)
+                slope[:] = (change * tells).mean(dim=1).numpy() / (2 * step_mm)
         return slopes
