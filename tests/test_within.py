@@ -10,8 +10,8 @@ from endotwin.effects.coat import Coat
 from endotwin.effects.tone import Tone
 from endotwin.effects.vignetting import Vignetting
 from endotwin.evidence.coat import judged
+from endotwin.evidence.tone import STRONGEST, Hues, steadied
 from endotwin.evidence.tone import judged as judged_tone
-from endotwin.evidence.tone import steadied
 from endotwin.fit.model import Globals, predict
 from endotwin.fit.state import ROUGHNESS_RANGE, roughness_to_raw
 from endotwin.fit.within import MODEL_ERROR, Varied, Within
@@ -137,6 +137,21 @@ def test_photos_without_a_tone_curve_get_none_whatever_the_light():
         shared = Globals.of(light, Response(gamma), f0=0.035)
         seen = within.hues(coloured(within, material, shared), shared, NOISE)
         assert judged_tone(seen, "auto")[0] is None
+
+
+def test_hues_that_no_curve_steadies_tell_of_none():
+    within, material = photographed(TRUE.under(Tone(0.4)))
+    seen = within.hues(coloured(within, material, TRUE), TRUE, NOISE)
+
+    def turned(tone: Tone) -> Hues:
+        hues = seen(tone)
+        return replace(hues, residual=hues.residual + hues.slopes[:, -1])
+
+    assert judged_tone(seen, "auto")[0].contrast == pytest.approx(0.4, abs=0.05)
+    tone, decision = judged_tone(turned, "auto")
+    assert tone is None and decision.state == "off"
+    forced, _ = judged_tone(turned, "on")
+    assert forced.contrast == STRONGEST
 
 
 def test_a_hint_of_a_coat_is_enough_where_all_pixels_are_asked_next():

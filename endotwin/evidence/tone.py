@@ -30,6 +30,8 @@ LEAST_CONTRAST = 0.1
 """Less is none: it changes values by 2.5 of 255 levels at most, and beside bounced light hues are known no
 better."""
 
+STRONGEST = Tone.parameters()[0].high
+
 HINT = LEAST_CONTRAST / 2
 """What hues have to ask for where light bounces, for all pixels to say whether there is a curve."""
 
@@ -64,7 +66,8 @@ def judged(without: Callable[[Tone], Hues], wanted: str) -> tuple[Tone | None, D
     Where light bounces they have to call for one beside a bounce of any strength, too: what the bounce
     lacks turns hues as well, most of all where its strength is found too far off. Beside the bounce that was
     found without a curve, and has made up for one, they ask for too little; beside any, for too much: a fit
-    of all may begin halfway, and says whether there is one where they give a HINT.
+    of all may begin halfway, and says whether there is one where they give a HINT. Hues that no curve
+    steadies, however strong, are turned by something else: by bounced light, if that was left out.
 
     Args:
         without: the hues, by the curve that is taken off.
@@ -80,6 +83,8 @@ def judged(without: Callable[[Tone], Hues], wanted: str) -> tuple[Tone | None, D
     enough = LEAST_CONTRAST if len(trials) == 1 else HINT
     sure = all(each.sigmas >= MIN_SIGMAS for _, each in trials) and least >= enough
     gain_db, took_s = round(verdict.gain_db, 3), round(time.perf_counter() - began, 3)
+    if wanted == "auto" and len(trials) == 1 and tone.contrast >= STRONGEST:
+        return None, Decision("off", f"none: hues ask for more than any curve has ({told})", gain_db, took_s)
     if wanted == "auto" and not sure:
         return None, Decision("off", f"none that counts: {told}", gain_db, took_s)
     forced = "forced on; " if wanted == "on" else ""
@@ -95,13 +100,12 @@ def _trials(without: Callable[[Tone], Hues]) -> list[tuple[Tone, Verdict]]:
 
 def steadied(tone: Tone, without: Callable[[Tone], Hues], passing: int = TISSUE) -> Tone:
     """The curve without which the hue of each place is steadiest, sought from ``tone``."""
-    (contrast,) = Tone.parameters()
     for _ in range(ROUNDS):
         hues = without(tone)
         if len(hues.residual) < LEAST_SIGHTINGS:
             return tone
         more = float(regress(hues.residual, hues.design(passing)).coefficients[-1])
-        before, tone = tone, Tone(float(np.clip(tone.contrast + more, contrast.low, contrast.high)))
+        before, tone = tone, Tone(float(np.clip(tone.contrast + more, 0.0, STRONGEST)))
         if abs(tone.contrast - before.contrast) < SETTLED:
             break
     return tone
