@@ -86,7 +86,7 @@ def test_a_guide_is_found_behind_the_lens_from_a_millimetre_aside(cast, within_m
     for _ in range(MOVES):
         within = Within.of(solver.samples, twin.surface, 1.0)
         material = at_pixels(solver.samples, solver.triangles, state.materials)
-        found = within.guided(material, shared, (), 1 / 255, relighting.moving)
+        found = within.moved(material, shared, (), 1 / 255, relighting.moving)
         relighting.move_guides(solver, found.aside_mm, state)
         shared = found.shared
     assert np.linalg.norm(np.subtract(relighting.effects.guides_mm, true)) < within_mm

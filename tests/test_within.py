@@ -10,7 +10,7 @@ from endotwin.effects.coat import Coat
 from endotwin.effects.tone import Tone
 from endotwin.effects.vignetting import Vignetting
 from endotwin.evidence.coat import judged
-from endotwin.evidence.tone import STRONGEST, Hues, steadied
+from endotwin.evidence.tone import CONTRAST, Hues, steadied
 from endotwin.evidence.tone import judged as judged_tone
 from endotwin.fit.model import Globals, predict
 from endotwin.fit.state import ROUGHNESS_RANGE, roughness_to_raw
@@ -151,7 +151,7 @@ def test_hues_that_no_curve_steadies_tell_of_none():
     tone, decision = judged_tone(turned, "auto")
     assert tone is None and decision.state == "off"
     forced, _ = judged_tone(turned, "on")
-    assert forced.contrast == STRONGEST
+    assert forced.contrast == CONTRAST.high
 
 
 def test_a_hint_of_a_coat_is_enough_where_all_pixels_are_asked_next():

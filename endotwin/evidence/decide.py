@@ -227,7 +227,7 @@ class _Trial:
             return here
         moved = settled(self._ground, self._probe.fit(replace(kept.hypothesis, profile=EXPONENTIAL)))
         moved = self._probe.fit(self._mixed(moved))
-        return moved if self._probe.compare(here, moved).gain_db > 0 else here
+        return self._probe.better(here, moved)
 
     def _verdict_beside(self, name: str, kept: Fitted, other: Fitted) -> Verdict:
         """On ``other``, which has the effect ``name`` as well. No endoscope's lens brightens the rim."""

@@ -51,7 +51,7 @@ LEAST_RATE = 1e-6
 
 MOST_GUIDES = 3
 
-WORTH = 3.0
+PLACES_A_GUIDE = 3.0
 """So many places of the tissue say as much of where a guide stands as all of its glints do: normals and lobes
 err alike in these, and throw them all to one side of it."""
 
@@ -99,7 +99,7 @@ class Glints:
         if not self.shone.any():
             return np.zeros(self.shone.size)
         _, spread_mm, rates = self._best(len(guides_mm))
-        weight = min(1.0, WORTH * len(guides_mm) * place_pixels / self.shone.sum())
+        weight = min(1.0, PLACES_A_GUIDE * len(guides_mm) * place_pixels / self.shone.sum())
         return np.sqrt(weight) * self._residuals(np.asarray(guides_mm)[:, :2], spread_mm, rates)
 
     def told(self) -> int:

@@ -180,7 +180,7 @@ def polished(ground: Ground, model: Fitted) -> Fitted:
 def _moved(probe: Probe, model: Fitted, guides_mm: Guides) -> Fitted:
     """``model`` with guides at ``guides_mm`` where held-out pixels say that it is better so."""
     moved = probe.fit(replace(model.hypothesis, guides_mm=guides_mm))
-    return moved if probe.compare(model, moved).gain_db > 0 else model
+    return probe.better(model, moved)
 
 
 class Search:
@@ -270,8 +270,8 @@ class Search:
         return self._probe.linearised(self._with(guides_mm), self._base, self._ground.visible(guides_mm))
 
     def _glints(self, guides_mm: np.ndarray) -> np.ndarray:
-        """Residuals of the glints."""
-        return self._ground.glints.residuals(guides_mm, len(self._probe) / self._probe.count)
+        """Residuals of the glints, weighed as those of the probe's pixels are."""
+        return self._ground.glints.residuals(guides_mm, self._probe.pixels_a_place)
 
     def _with(self, guides_mm: np.ndarray) -> Hypothesis:
         return replace(self._base.hypothesis, guides_mm=_plain(guides_mm), shadows=True)

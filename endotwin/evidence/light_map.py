@@ -131,7 +131,7 @@ class _Light:
         if hypothesis.vignetting:
             columns.append(probe.vignetting_column[:, None])
             mean, spread = [*mean, 0.0], [*spread, VIGNETTING_SPREAD]
-        precision = len(probe) / max(probe.count, 1) / np.square(spread)
+        precision = probe.pixels_a_place / np.square(spread)
         return Design(
             np.concatenate(columns, axis=1),
             probe.vertex,

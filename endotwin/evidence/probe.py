@@ -172,6 +172,11 @@ class Probe(Sightings):
         numbers = np.searchsorted(known, every[rows])
         self.dark = Sightings(samples[torch.from_numpy(rows)], numbers, twin, caster)
 
+    @property
+    def pixels_a_place(self) -> float:
+        """How many there are of a vertex, in the mean."""
+        return len(self) / max(self.count, 1)
+
     def part(self, pixels: int) -> tuple[Probe, np.ndarray]:
         """A probe of about so many of these pixels, all of some vertices; and which, int [M]."""
         part = Probe(self.samples, self.twin, self.caster, pixels)
@@ -210,6 +215,10 @@ class Probe(Sightings):
         possible = other.possible or not base.possible
         likelier = base.unusual - other.unusual if other.possible else 0.0
         return replace(verdict, possible=possible, likelier=likelier)
+
+    def better(self, base: Fitted, other: Fitted) -> Fitted:
+        """``other`` where it predicts pixels of vertices that did not choose its coefficients better."""
+        return other if self.compare(base, other).gain_db > 0 else base
 
     def shaded_db(self, found: Fitted) -> float:
         """By how much the mean square of what ``found`` leaves would grow if nothing explained the shadows
@@ -265,7 +274,7 @@ class Probe(Sightings):
         if hypothesis.uneven:
             count = len(self.frames)
             mean, spread = [*mean, *[0.0] * count], [*spread, *[PRIOR["gamma"] * UNEVEN_SPREAD] * count]
-        precision = len(self) / max(self.count, 1) / np.square(spread)
+        precision = self.pixels_a_place / np.square(spread)
         return Design(
             _columns(self, hypothesis, light, about),
             self.vertex,

@@ -30,7 +30,8 @@ LEAST_CONTRAST = 0.1
 """Less is none: it changes values by 2.5 of 255 levels at most, and beside bounced light hues are known no
 better."""
 
-STRONGEST = Tone.parameters()[0].high
+(CONTRAST,) = Tone.parameters()
+"""Its range: the search for a curve ends at its edges."""
 
 HINT = LEAST_CONTRAST / 2
 """What hues have to ask for where light bounces, for all pixels to say whether there is a curve."""
@@ -83,7 +84,7 @@ def judged(without: Callable[[Tone], Hues], wanted: str) -> tuple[Tone | None, D
     enough = LEAST_CONTRAST if len(trials) == 1 else HINT
     sure = all(each.sigmas >= MIN_SIGMAS for _, each in trials) and least >= enough
     gain_db, took_s = round(verdict.gain_db, 3), round(time.perf_counter() - began, 3)
-    if wanted == "auto" and len(trials) == 1 and tone.contrast >= STRONGEST:
+    if wanted == "auto" and len(trials) == 1 and tone.contrast >= CONTRAST.high:
         return None, Decision("off", f"none: hues ask for more than any curve has ({told})", gain_db, took_s)
     if wanted == "auto" and not sure:
         return None, Decision("off", f"none that counts: {told}", gain_db, took_s)
@@ -105,7 +106,7 @@ def steadied(tone: Tone, without: Callable[[Tone], Hues], passing: int = TISSUE)
         if len(hues.residual) < LEAST_SIGHTINGS:
             return tone
         more = float(regress(hues.residual, hues.design(passing)).coefficients[-1])
-        before, tone = tone, Tone(float(np.clip(tone.contrast + more, 0.0, STRONGEST)))
+        before, tone = tone, Tone(float(np.clip(tone.contrast + more, CONTRAST.low, CONTRAST.high)))
         if abs(tone.contrast - before.contrast) < SETTLED:
             break
     return tone

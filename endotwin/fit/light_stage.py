@@ -191,13 +191,13 @@ class LightStage:
                 return toned
             if ready and self._took_tone_back():
                 number = 0
-            shared = self._guided(self._judged(ready))
+            shared = self._move_guides(self._judged(ready))
             self._renew(shared, self._undetermined, self._noise)
             if late:
                 break
             gain = self._step(joint=False)
-            near = self._changed_by_less(gain, CONVERGED) and not self._moves
-            number = self._next(number, STEPS, COAT_STEP, near)
+            done = self._changed_by_less(gain, CONVERGED) and not self._moves
+            number = self._next(number, STEPS, COAT_STEP, done)
         self._without_faint()
         return None
 
@@ -230,12 +230,12 @@ class LightStage:
             if near and self._bare is None:
                 self._solver.learn_error(self._state)
                 best = self._better(best)
-                self._state = replace(self._state, shared=self._guided(self._state.shared))
+                self._state = replace(self._state, shared=self._move_guides(self._state.shared))
             if tried:
                 self._choose_lobe()
             steady = self._changed_by_less(gain, CONVERGED) or _steady(shared, self._state.shared)
-            steady &= not (holding or self._moves)
-            number = self._next(number, BOUNCE_STEPS, number + 1, steady)
+            done = steady and not holding and not self._moves
+            number = self._next(number, BOUNCE_STEPS, number + 1, done)
             near = near or number >= LATEST or (self._changed_by_less(gain, NEAR) and not holding)
         self._leave_worse_coat()
         if best is not None:
@@ -295,17 +295,17 @@ class LightStage:
         relighting.vary(self._solver, found)
         self._take(found)
 
-    def _guided(self, shared: Globals) -> Globals:
-        """Light and response with guides moved to where, shadows included, they explain best what varies
-        within vertices, unless they are at rest: the probe that had found them knew of no coat, and less of
-        the bounce."""
+    def _move_guides(self, shared: Globals) -> Globals:
+        """Move the guides, unless they are at rest, to where, shadows included, they explain best what varies
+        within vertices: the probe that had found them knew of no coat, and less of the bounce. Light and
+        response beside that."""
         if not self._moves or self._late:
             return shared
         relighting, held = self._relighting, self._undetermined
         if relighting.bounces:
             held = (*held, *BOUNCE_HELD, "albedo scale")
         within, material = self._within()
-        found = within.guided(material, shared, held, self._noise, relighting.moving)
+        found = within.moved(material, shared, held, self._noise, relighting.moving)
         if np.abs(found.aside_mm).max() < AT_REST * within.samples.distance_mm:
             self._moves = 0
             return shared

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 import torch
@@ -80,19 +81,22 @@ def _visible(samples: Samples, caster: Caster, guides_mm: np.ndarray) -> np.ndar
 
 def guides_aside(
     samples: Samples, surface: Surface, caster: Caster, effects: Effects, step_mm: float
-) -> Iterator[Samples]:
-    """``samples`` lit by each guide moved by ``step_mm`` along x, then along y and z."""
+) -> Iterator[tuple[Samples, Samples]]:
+    """``samples`` lit by each guide moved by ``step_mm`` along x, then along y and z, and as far back."""
     guides_mm = np.asarray(effects.guides_mm, np.float32)
     visible = _visible(samples, caster, guides_mm) if "shadows" in effects else None
     normals, points_mm = samples.normals(surface), samples.points_mm
-    for k in range(len(guides_mm)):
-        for axis in range(3):
-            moved_mm = guides_mm.copy()
-            moved_mm[k, axis] += step_mm
-            seen = None if visible is None else visible.copy()
-            if seen is not None:
-                seen[:, k] = _visible(samples, caster, moved_mm[k : k + 1])[:, 0]
-            yield replace(samples, guides=guided(points_mm, normals, moved_mm, effects.profile, seen))
+
+    def lit_aside(k: int, aside_mm: np.ndarray) -> Samples:
+        moved_mm = guides_mm.copy()
+        moved_mm[k] += aside_mm
+        seen = None if visible is None else visible.copy()
+        if seen is not None:
+            seen[:, k] = _visible(samples, caster, moved_mm[k : k + 1])[:, 0]
+        return replace(samples, guides=guided(points_mm, normals, moved_mm, effects.profile, seen))
+
+    for k, along_mm in product(range(len(guides_mm)), step_mm * np.eye(3, dtype=np.float32)):
+        yield lit_aside(k, along_mm), lit_aside(k, -along_mm)
 
 
 class Relighting:
@@ -128,7 +132,7 @@ class Relighting:
     def moving(self) -> Varied:
         """What changes while guides beside the lens move."""
 
-        def aside(samples: Samples, step_mm: float) -> Iterator[Samples]:
+        def aside(samples: Samples, step_mm: float) -> Iterator[tuple[Samples, Samples]]:
             return guides_aside(samples, self._surface, self._caster, self.effects, step_mm)
 
         return replace(self.varied, faint=NOTHING, guides=len(self.effects.guides_mm), aside=aside)
@@ -152,12 +156,12 @@ class Relighting:
 
     def _take(self, effects: Effects, solver: GaussNewton) -> None:
         """``effects`` from here on, and the samples of ``solver`` as their guides light them."""
-        moved, self.effects = effects.guides_mm != self.effects.guides_mm, effects
-        if moved:
-            samples = solver.samples
-            guides = _guided(samples, self._surface, self._caster, effects)
-            solver.relight(replace(samples, guides=guides))
-        if moved and self.bounces:
+        before, self.effects = self.effects, effects
+        if effects.guides_mm == before.guides_mm:
+            return
+        guides = _guided(solver.samples, self._surface, self._caster, effects)
+        solver.relight(replace(solver.samples, guides=guides))
+        if self.bounces:
             self._bouncer.light_from(effects)
 
     def brighten(self, solver: GaussNewton, log_gain: np.ndarray) -> None:

@@ -85,14 +85,14 @@ class Varied:
         frames: how many frames have gains of their own, one after the other as in the samples' views.
         faint: effects that may be there.
         guides: how many may move.
-        aside: samples, and mm, to the same ones lit by guides moved so far: each in turn, along x, then
-            y and z.
+        aside: samples, and mm, to the same ones lit by guides moved so far to either side: each in turn,
+            along x, then y and z.
     """
 
     frames: int = 0
     faint: Faint = NOTHING
     guides: int = 0
-    aside: Callable[[Samples, float], Iterator[Samples]] | None = None
+    aside: Callable[[Samples, float], Iterator[tuple[Samples, Samples]]] | None = None
 
 
 STILL = Varied()
@@ -163,23 +163,20 @@ class Within:
             material: [N, 4] at the samples. held: which of n, q and gamma stay. noise: of a pixel, in display
                 values.
         """
-        diffuse = self.samples.sin2 > DIFFUSE_SIN2
-        found = self._step(material, shared, (*held, "level", "f0", "k2", "contrast"), diffuse, noise, varied)
+        found = self._dull_step(material, shared, held, noise, varied)
         if not shared.specular:
             return found
         shone = self.shone(material, found.shared, noise)
         return replace(found, shared=shone.shared, roughness=shone.roughness)
 
-    def guided(
+    def moved(
         self, material: Tensor, shared: Globals, held: tuple[str, ...], noise: float, varied: Varied
     ) -> Renewed:
         """A Gauss–Newton step of light, response and guides, which are among what is ``varied``, by what is
         off the highlights of some vertices. Arguments as in ``renewed``."""
-        rows = torch.from_numpy(self.vertex % max(1, len(self.samples) // GUIDE_PIXELS) == 0)
+        rows = self._of_some(torch.ones(len(self.samples), dtype=torch.bool), GUIDE_PIXELS)
         some = replace(self, samples=self.samples[rows], vertex=self.vertex[rows.numpy()])
-        diffuse = some.samples.sin2 > DIFFUSE_SIN2
-        held = (*held, "level", "f0", "k2", "contrast")
-        return some._step(material[rows], shared, held, diffuse, noise, varied)
+        return some._dull_step(material[rows], shared, held, noise, varied)
 
     def shone(self, material: Tensor, shared: Globals, noise: float) -> Renewed:
         """A step of f0 and, where there is a coat, of it and of roughness, which pass for one another.
@@ -197,8 +194,7 @@ class Within:
         Args:
             material: [N, 4] at the samples. noise: of a pixel, in display values.
         """
-        shiny = self.samples.sin2 < DIFFUSE_SIN2
-        shiny &= torch.from_numpy(self.vertex % max(1, int(shiny.sum()) // HIGHLIGHT_PIXELS) == 0)
+        shiny = self._of_some(self.samples.sin2 < DIFFUSE_SIN2, HIGHLIGHT_PIXELS)
 
         def under(coat: Coat) -> Highlights:
             seen = self.sightings(material, replace(shared, coat=coat), shiny, noise, at_least=True)
@@ -213,8 +209,7 @@ class Within:
         Args:
             material: [N, 4] at the samples. noise: of a pixel, in display values.
         """
-        diffuse = self.samples.sin2 > DIFFUSE_SIN2
-        diffuse &= torch.from_numpy(self.vertex % max(1, int(diffuse.sum()) // HUE_PIXELS) == 0)
+        diffuse = self._of_some(self.samples.sin2 > DIFFUSE_SIN2, HUE_PIXELS)
         rows = self._coloured(diffuse)
         model = linearise(self.samples[rows], material[rows], shared.under(None))
         bright = ((model.predicted > DARKEST) & (model.predicted < 1)).all(dim=1)
@@ -239,6 +234,17 @@ class Within:
             return Hues(*map(np.concatenate, zip(*found, strict=True)))
 
         return without
+
+    def _of_some(self, chosen: Tensor, pixels: int) -> Tensor:
+        """Of the ``chosen`` samples (bool [N]) about so many, all of some vertices."""
+        return chosen & torch.from_numpy(self.vertex % max(1, int(chosen.sum()) // pixels) == 0)
+
+    def _dull_step(
+        self, material: Tensor, shared: Globals, held: tuple[str, ...], noise: float, varied: Varied
+    ) -> Renewed:
+        """That of light, response and what is ``varied``, by what is off the highlights."""
+        diffuse = self.samples.sin2 > DIFFUSE_SIN2
+        return self._step(material, shared, (*held, "level", "f0", "k2", "contrast"), diffuse, noise, varied)
 
     def _coloured(self, chosen: Tensor) -> Tensor:
         """Rows [R] of the ``chosen`` samples (bool [N]) in which no channel is dark or clipped."""
@@ -369,8 +375,7 @@ class Within:
         slopes = np.zeros((3 * varied.guides, len(rows)))
         if varied.guides:
             samples, material, step_mm = self.samples[rows], material[rows], ASIDE * self.samples.distance_mm
-            moved = (varied.aside(samples, step_mm), varied.aside(samples, -step_mm))
-            for slope, more, less in zip(slopes, *moved, strict=True):
+            for slope, (more, less) in zip(slopes, varied.aside(samples, step_mm), strict=True):
                 change = predict(more, material, shared) - predict(less, material, shared)
                 slope[:] = (change * tells).mean(dim=1).numpy() / (2 * step_mm)
         return slopes

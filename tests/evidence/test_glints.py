@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from scenes import pinhole
 from scipy.spatial.transform import Rotation
 
-from endotwin.evidence.glints import WORTH, Glints, crossings_mm, outshining
+from endotwin.evidence.glints import PLACES_A_GUIDE, Glints, crossings_mm, outshining
 from endotwin.pixels.samples import Samples, Views
 from endotwin.pixels.start import Start
 from endotwin.surface import Surface
@@ -92,7 +92,7 @@ def test_half_the_squares_of_the_residuals_are_negative_log_likelihoods():
     lost = negative_log_likelihood(aside_mm) - negative_log_likelihood(THREE_MM)
     assert lost > 0
     assert half_squares(aside_mm, every) - half_squares(THREE_MM, every) == pytest.approx(lost)
-    worth = 3 * WORTH * 8 / every
+    worth = 3 * PLACES_A_GUIDE * 8 / every
     assert half_squares(aside_mm, 8) - half_squares(THREE_MM, 8) == pytest.approx(worth * lost)
 
 
