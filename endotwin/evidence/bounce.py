@@ -55,25 +55,43 @@ class Surroundings:
         sends its share of the light back, and on to the camera: for each pixel, the irradiance is that under
         which base colours alone would look as bright.
         """
-        probe = self._probe
-        guides = hypothesis.guides_mm, hypothesis.profile
-        light = BouncedLight(self._radiosity, probe.T_local_camera, *guides)
-        direct = probe.direct_light(hypothesis, PRIOR["n"], PRIOR["q"])
+        light, direct = self._lights(hypothesis)
         tried = list(on_all_cores(lambda each: self._under(light, direct, each), PROBE_ALBEDOS))
-        models = [probe.fit(replace(hypothesis, bounced=each)) for each in tried]
-        gains_db = [probe.compare(models[0], model).gain_db for model in models]
+        models = [self._probe.fit(replace(hypothesis, bounced=each)) for each in tried]
+        gains_db = [self._probe.compare(models[0], model).gain_db for model in models]
         return tried[int(np.argmax(gains_db))]
 
-    def _under(self, light: BouncedLight, direct: np.ndarray, brightest: float) -> Bounced:
-        """Where the brightest tissue has that albedo, and ``direct`` [N] comes from the ``light`` itself."""
-        n, q, there = PRIOR["n"], PRIOR["q"], direct
+    def log_colors(self, hypothesis: Hypothesis) -> np.ndarray:
+        """ln of the light, direct and bounced, that each channel gets at the pixels, [N, 3], with n, q and γ
+        at their priors, if the brightest tissue has the middle one of PROBE_ALBEDOS."""
+        light, direct = self._lights(hypothesis)
+        albedo = self._albedo(light, direct, PROBE_ALBEDOS[1])
+        irradiance = light.at(self._places, PRIOR["n"], PRIOR["q"], albedo)
+        color = self._places.weights @ albedo.base_color
+        return np.log(direct[:, None] + irradiance * (1 + self._gloss[:, None] / color))
+
+    def _lights(self, hypothesis: Hypothesis) -> tuple[BouncedLight, np.ndarray]:
+        """What throws light, and the irradiance [N] that comes from there itself."""
+        guides = hypothesis.guides_mm, hypothesis.profile
+        light = BouncedLight(self._radiosity, self._probe.T_local_camera, *guides)
+        return light, self._probe.direct_light(hypothesis, PRIOR["n"], PRIOR["q"])
+
+    def _albedo(self, light: BouncedLight, direct: np.ndarray, brightest: float) -> Albedo:
+        """That of patches where the brightest tissue has that albedo, and ``direct`` [N] comes from the
+        ``light`` itself."""
+        there = direct
         for _ in range(FIXED_POINT_ROUNDS):
             base_color = _patch_albedo(self._linear, there, self._patch, self._radiosity.count, brightest)
             albedo = Albedo(base_color, self._glossy)
-            there = direct + self._seen(light.at(self._places, n, q, albedo), base_color)
+            there = direct + self._seen(light.at(self._places, PRIOR["n"], PRIOR["q"], albedo), base_color)
+        return albedo
+
+    def _under(self, light: BouncedLight, direct: np.ndarray, brightest: float) -> Bounced:
+        """The bounce off patches of which the brightest have that albedo. Arguments as of ``_albedo``."""
+        n, q, albedo = PRIOR["n"], PRIOR["q"], self._albedo(light, direct, brightest)
         found = light.expanded(self._places, n, q, albedo, by=("n", "q"))
-        log = np.log(np.maximum(self._seen(found.irradiance(n, q).numpy(), base_color), 1e-30))
-        return Bounced(log, found.by_n.numpy(), found.by_q.numpy())
+        seen = self._seen(found.irradiance(n, q).numpy(), albedo.base_color)
+        return Bounced(np.log(np.maximum(seen, 1e-30)), found.by_n.numpy(), found.by_q.numpy())
 
     def _seen(self, irradiance: np.ndarray, base_color: np.ndarray) -> np.ndarray:
         """Irradiance [N, 3] as tissue of base colours [P, 3] shows it, [N]."""

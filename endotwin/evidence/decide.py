@@ -4,7 +4,8 @@ coefficients.
 One effect can pass for another: a gain of each frame swallows most of a bounce that is left out, a vignetting
 a guide. So where the light stands, whether it bounces and whether the camera's gain changes are decided
 together: of all combinations the one that predicts best, less what is not worth its place beside the rest.
-Profile and vignetting, which say little and nearly the same, follow beside what was kept.
+Profile and vignetting, which say little and nearly the same, follow beside what was kept. Only a bounce
+turns hues: where these tell of one, there is no set without it.
 """
 
 from __future__ import annotations
@@ -32,6 +33,7 @@ from endotwin.evidence.glints import Glints
 from endotwin.evidence.guide_search import Ground, Guides, Search, found_guides, polished, settled
 from endotwin.evidence.log_light import Bounced
 from endotwin.evidence.probe import Fitted, Hypothesis, Probe
+from endotwin.evidence.tint import turned
 from endotwin.evidence.verdict import MIN_GAIN_DB, MIN_IMPOSSIBLE_DB, MIN_SIGMAS, Verdict
 from endotwin.evidence.worth import BARE, LEAST, more_usual, worth
 from endotwin.light.guides import AT_LENS, COSINE, EXPONENTIAL
@@ -126,6 +128,22 @@ class _Trial:
         for name in TOGETHER:
             self._say(name, name in kept, verdicts.get(name) or self._beside_kept(name, kept))
         return self._probe.fit(replace(self._model(kept).hypothesis, vignetting=False))
+
+    @cached_property
+    def _hues(self) -> Verdict | None:
+        """How much better light that bounces predicts held-out hues; None where that is not asked. Guides
+        hardly change it, so that it is told before they are sought."""
+        if self.wanted("interreflection") != "auto" or not len(self._probe):
+            return None
+        began = time.perf_counter()
+        model = self._probe.fit(Hypothesis(gain=self._tellable("gain", None)))
+        verdict = turned(self._probe, model, self._surroundings.log_colors(model.hypothesis))
+        self._seconds["interreflection"] += time.perf_counter() - began
+        return verdict
+
+    @property
+    def _told_by_hues(self) -> bool:
+        return self._hues is not None and self._hues.worth(LEAST)
 
     def _seek_guides(self, best: frozenset[str]) -> None:
         """Find the guides without and with bounced light, if there are any beside the ``best`` set without
@@ -270,11 +288,13 @@ class _Trial:
 
     def _sets(self, names: Iterable[str]) -> list[frozenset[str]]:
         """All sets of the effects ``names`` that are wanted and can be told, in which those that are forced
-        are on."""
+        are on, and bounced light that hues tell of."""
         told = [name for name in names if self._tellable(name, None)]
-        forced = frozenset(name for name in told if self.wanted(name) == "on")
-        free = [name for name in told if self.wanted(name) == "auto"]
-        return [forced.union(some) for count in range(len(free) + 1) for some in combinations(free, count)]
+        certain = frozenset(name for name in told if self.wanted(name) == "on")
+        if "interreflection" in told and self._told_by_hues:
+            certain |= {"interreflection"}
+        free = [name for name in told if self.wanted(name) == "auto" and name not in certain]
+        return [certain.union(some) for count in range(len(free) + 1) for some in combinations(free, count)]
 
     def _fitted(self, names: frozenset[str]) -> Fitted:
         began = time.perf_counter()
@@ -330,6 +350,8 @@ class _Trial:
         model = self._model(names)
         if name == "offset":
             return self._ground.borne_out(model, verdict) or self._ground.certain(model, verdict)
+        if name == "interreflection" and self._told_by_hues:
+            return True
         return worth(name, verdict, model) and (name != "gain" or self._gain_is_plain(names))
 
     def _no_uneven_bounce(self, names: frozenset[str]) -> bool:
@@ -380,6 +402,8 @@ class _Trial:
                 reason = (
                     f"glints stand about guides, and no held-out pixels plainly contradict it ({verdict})"
                 )
+            elif not forced and name == "interreflection" and self._told_by_hues:
+                reason = f"predicts held-out hues better by {self._hues}, and pixels by {verdict}"
             elif not forced and name == "interreflection" and not verdict.worth(LEAST):
                 reason = (
                     f"beside it light and response are more usual; held-out pixels hardly tell ({verdict})"
@@ -390,7 +414,8 @@ class _Trial:
             reason = f"bounced light that is a little off would explain as much ({verdict})"
         elif verdict is not None:
             hardly = "hardly predicts" if verdict.gain_db > 0 else "does not predict"
-            reason = f"{hardly} held-out pixels better ({verdict})"
+            hues = f"; hues {self._hues}" if name == "interreflection" and self._hues else ""
+            reason = f"{hardly} held-out pixels better ({verdict}{hues})"
         else:
             known = {
                 "offset": "no position of one to three guides predicts better",

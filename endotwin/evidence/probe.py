@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
+from endotwin.effects.noise import LEVEL
 from endotwin.evidence.log_light import LIGHT_COLUMNS, TISSUE_MEAN, About, Bounced, LogLight, Tissue
 from endotwin.evidence.sightings import Sightings
 from endotwin.evidence.verdict import Halved, Verdict, compared, verdict_of
@@ -153,7 +154,8 @@ class Probe(Sightings):
     """Sightings of some vertices, all that tell their light, and hypotheses about it.
 
     Attributes:
-        count: number of the vertices. dark: other sightings of them, that show no light.
+        count: number of the vertices. half: bool [N], of whole vertices, drawn by chance. dark: other
+            sightings of the vertices, that show no light.
     """
 
     def __init__(self, samples: Samples, twin: Twin, caster: Caster, pixels: int = PIXELS, seed: int = 0):
@@ -165,7 +167,7 @@ class Probe(Sightings):
         known, vertex = np.unique(every[self._rows], return_inverse=True)
         super().__init__(samples[torch.from_numpy(self._rows)], vertex.reshape(-1), twin, caster)
         self.count = len(known)
-        self._half = (generator.random(self.count) < 0.5)[self.vertex]
+        self.half = (generator.random(self.count) < 0.5)[self.vertex]
         self.target = np.log(self.shown)
         rows = np.flatnonzero(dark(samples) & np.isin(every, known))
         rows = rows[np.isin(samples.frame.numpy()[rows], self.frames)]
@@ -193,7 +195,7 @@ class Probe(Sightings):
             held = about.tissue.at_bounds & (number == ROUNDS - 1)
             design = self._design(hypothesis, light, about, held)
             effects = regress(self.target, design, len(self.frames))
-            found = Fitted(hypothesis, design, effects, about, self.target, self._half)
+            found = Fitted(hypothesis, design, effects, about, self.target, self.half)
             if found.gamma <= LEAST_GAMMA or number == ROUNDS - 1 or not len(self):
                 break
             about = About(found.n, found.q, found.tissue, self._albedo(found))
@@ -252,6 +254,16 @@ class Probe(Sightings):
         design = Design(columns, sightings.vertex, self.count, frame if hypothesis.gain else None)
         shown = np.exp(design.explained(found.effects) + self._intercepts(found)[sightings.vertex])
         return shown * sightings.lit(hypothesis.guides_mm, hypothesis.shadows)
+
+    def smooth_colors(self, found: Fitted) -> np.ndarray:
+        """Display values [N, 3] as ``found`` has the pixels' brightness, each place of one hue."""
+        color = self.shown_colors
+        hue = np.log(color) - np.log(color.mean(axis=1, keepdims=True))
+        sums = np.stack([np.bincount(self.vertex, each, self.count) for each in hue.T], axis=1)
+        count = np.maximum(np.bincount(self.vertex, minlength=self.count), 1)
+        log_color = (self._intercepts(found)[:, None] + sums / count[:, None])[self.vertex]
+        light = found.design.explained(found.effects)[:, None]
+        return np.clip(np.exp(light + log_color), LEVEL, 1)
 
     def _intercepts(self, found: Fitted) -> np.ndarray:
         """What is left of ln C at each vertex, [count]."""

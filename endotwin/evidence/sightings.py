@@ -89,6 +89,11 @@ class Sightings:
         return trust(self.samples.cos.numpy().astype(np.float64))
 
     @cached_property
+    def shown_colors(self) -> np.ndarray:
+        """Display values of each pixel, in 0 … 1 and not 0, float64 [N, 3]."""
+        return np.maximum(self.samples.color.numpy(), 1) / 255
+
+    @cached_property
     def shown(self) -> np.ndarray:
         """Mean display value of each pixel, 0 … 1, [N]."""
         return self.samples.color.numpy().mean(axis=1, dtype=np.float64) / 255

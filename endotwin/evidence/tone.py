@@ -20,6 +20,13 @@ from endotwin.evidence.coat import LEAST_SIGHTINGS
 from endotwin.evidence.verdict import MIN_SIGMAS, Halved, Verdict, compared
 from endotwin.pixels.fixed_effects import Design, regress
 
+RATIOS = np.array([[1.0, -1.0, 0.0], [0.5, 0.5, -1.0]])
+"""Red to green, and both to blue, of the channels' logarithms."""
+
+RATIO_ERROR = 0.004
+"""Relative error of a prediction of such a ratio: what a normal or a distance errs by is alike in all
+channels."""
+
 ROUNDS, SETTLED = 4, 0.002
 """At most so many, and none after one that moves the contrast by less: a twentieth of a level of 255."""
 

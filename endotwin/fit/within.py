@@ -23,7 +23,7 @@ from torch import Tensor
 from endotwin.effects.coat import Coat
 from endotwin.effects.tone import Tone, bend
 from endotwin.evidence.coat import LEAST_SIGHTINGS, Highlights
-from endotwin.evidence.tone import Hues
+from endotwin.evidence.tone import RATIO_ERROR, RATIOS, Hues
 from endotwin.fit.faint import NOTHING, Faint
 from endotwin.fit.gauss_newton import TEMPER
 from endotwin.fit.model import F0, GLOBALS, Globals, free_directions, linearise, predict
@@ -43,12 +43,6 @@ DARKEST = 0.03
 MODEL_ERROR = 0.02
 """Relative error of a prediction whose noise is 0, where light meets tissue head-on: distances, albedo within
 a vertex's cell."""
-
-RATIO_ERROR = 0.004
-"""That of a ratio of channels: what a normal or a distance errs by is alike in all of them."""
-
-RATIOS = torch.tensor([[1.0, -1.0, 0.0], [0.5, 0.5, -1.0]], dtype=torch.float64)
-"""Red to green, and both to blue, of the channels' logarithms."""
 
 COAT_SPREAD = 2.0
 """Standard deviation of a coat's weight about 0: tissue is wet, not lacquered."""
@@ -226,7 +220,7 @@ class Within:
             steep, found = predicted * tone.slope(predicted), []
             untoned = torch.log(torch.from_numpy(tone.undone(shown)) / predicted)
             relative = [untoned, *(x / predicted for x in passing), bend(predicted) / steep]
-            for number, ratio in enumerate(RATIOS):
+            for number, ratio in enumerate(torch.from_numpy(RATIOS)):
                 variance = ((noise / steep) ** 2 @ ratio**2).numpy()
                 columns = tuple((x @ ratio).numpy() for x in relative)
                 place, _, *means, weight = self._means(rows, columns, variance, alike)
