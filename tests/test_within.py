@@ -280,6 +280,17 @@ def test_photos_without_a_usable_pixel_change_nothing():
     assert replace(within, samples=white).renewed(material, TRUE, (), NOISE).shared is TRUE
 
 
+def test_a_black_shadow_that_is_a_little_off_does_not_bend_the_light():
+    within, material = photographed()
+    color, far = within.samples.color.clone(), within.samples.log_distance > np.log(36)
+    color[far & (torch.arange(len(color)) % 2 == 0)] = 3
+    within = replace(within, samples=replace(within.samples, color=color))
+    shared = TRUE
+    for _ in range(3):
+        shared = within.renewed(material, shared, (), NOISE).shared
+    assert told(shared)[:3] == pytest.approx(told(TRUE)[:3], rel=0.01)
+
+
 def test_under_a_coat_that_shines_a_clipped_photo_says_at_least():
     within, material = photographed()
     white = replace(within, samples=replace(within.samples, color=torch.full_like(within.samples.color, 255)))

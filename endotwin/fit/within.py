@@ -38,7 +38,9 @@ from endotwin.surface import Surface
 LEVEL = GLOBALS.index("gamma·ln L0")
 
 DARKEST = 0.03
-"""Display value of the prediction below which noise rules the logarithm."""
+"""Display value of photo or prediction below which noise rules the logarithm. Where a black shadow is a
+little off, neither the side that is too bright nor the one that is too dark tells: either alone would seem to
+say that it is too small, or too large."""
 
 MODEL_ERROR = 0.02
 """Relative error of a prediction whose noise is 0, where light meets tissue head-on: distances, albedo within
@@ -326,10 +328,10 @@ class Within:
         tells = ~clipped[rows] | (model.predicted < 1)
         floor = math.exp(shared.gamma * math.log(shading.RADIANCE_MIN))
         predicted = torch.where(tells, model.predicted, 1.0).double().mean(dim=1)
-        bright = (predicted > DARKEST) & tells.any(dim=1)
+        shown = self.samples.color[rows].double().mean(dim=1) / 255
+        bright = (torch.minimum(shown, predicted) > DARKEST) & tells.any(dim=1)
         rows, tells, predicted = rows[bright], tells[bright].double(), (predicted[bright] + floor).numpy()
-        shown = self.samples.color[rows].double().mean(dim=1).numpy()
-        residual = np.log(shown / 255 + floor) - np.log(predicted)
+        residual = np.log(shown[bright].numpy() + floor) - np.log(predicted)
         slopes = (model.by_globals[bright] * tells[..., None]).mean(dim=1).numpy() / predicted[:, None]
         by_coat = np.zeros(len(predicted))
         if model.by_coat is not None:
