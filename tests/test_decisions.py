@@ -51,6 +51,18 @@ def test_a_fit_finds_what_a_scene_has_and_nothing_else(find, seed: int, effects:
 
 
 @pytest.mark.long
+@pytest.mark.parametrize(
+    ("seed", "effects"),
+    [(1725, {"offset", "shadows", "interreflection", "gain"}), (1741, {"interreflection", "tone"})],
+)
+def test_a_bounce_that_brightness_hides_is_told_by_hues(find, seed: int, effects: set[str]) -> None:
+    twin, made = find(seed, effects)
+    assert {name for name in EFFECTS if twin.decisions[name].state == "on"} == effects
+    assert "hues" in twin.decisions["interreflection"].reason
+    assert twin.response.gamma == pytest.approx(made["gamma"], rel=0.04)
+
+
+@pytest.mark.long
 def test_the_strength_of_a_bounce_off_pale_tissue_is_found(find) -> None:
     """The 98th percentile of its red is 0.85, not far below a furnace."""
     twin, made = find(237, {"interreflection"})

@@ -145,9 +145,13 @@ class _Trial:
     def _told_by_hues(self) -> bool:
         return self._hues is not None and self._hues.worth(LEAST)
 
+    def _open(self, name: str) -> bool:
+        """Whether brightness is to decide on an effect: nobody asked for it or forbade it, nor hues told."""
+        return self.wanted(name) == "auto" and not (name == "interreflection" and self._told_by_hues)
+
     def _seek_guides(self, best: frozenset[str]) -> None:
-        """Find the guides without and with bounced light, if there are any beside the ``best`` set without
-        them; at last beside the bounce of their own light.
+        """Find the guides without and with bounced light, or with it alone if it is certain, if there are any
+        beside the ``best`` set without them; at last beside the bounce of their own light.
 
         A gain that is not worth its place would explain what guides throw, and hide where they are. Where
         bounced light is left out, a guide near the lens throws into the shadows what nothing else does, and
@@ -158,7 +162,7 @@ class _Trial:
         bounces = base.bounced is not None
         found_mm = other_mm = self._found_guides(base, self.wanted("offset") == "on")
         none = bounces and found_mm == AT_LENS
-        if self.wanted("interreflection") == "auto" and not none and not self._late():
+        if self._open("interreflection") and not none and not self._late():
             other = replace(base, bounced=None if bounces else self._bouncing(AT_LENS))
             other_mm = self._found_guides(other, False)
         self._guides_mm = {bounces: _first(found_mm, other_mm), not bounces: _first(other_mm, found_mm)}
@@ -289,11 +293,9 @@ class _Trial:
     def _sets(self, names: Iterable[str]) -> list[frozenset[str]]:
         """All sets of the effects ``names`` that are wanted and can be told, in which those that are forced
         are on, and bounced light that hues tell of."""
-        told = [name for name in names if self._tellable(name, None)]
-        certain = frozenset(name for name in told if self.wanted(name) == "on")
-        if "interreflection" in told and self._told_by_hues:
-            certain |= {"interreflection"}
-        free = [name for name in told if self.wanted(name) == "auto" and name not in certain]
+        told = [name for name in names if self.wanted(name) != "off" and self._tellable(name, None)]
+        free = [name for name in told if self._open(name)]
+        certain = frozenset(told).difference(free)
         return [certain.union(some) for count in range(len(free) + 1) for some in combinations(free, count)]
 
     def _fitted(self, names: frozenset[str]) -> Fitted:
@@ -340,7 +342,7 @@ class _Trial:
         while True:
             judged = names.intersection(free)
             verdicts = {name: self._verdict(names - {name}, names) for name in judged}
-            unworthy = [name for name in judged if self.wanted(name) == "auto"]
+            unworthy = [name for name in judged if self._open(name)]
             unworthy = [name for name in unworthy if not self._worth_within(names, name, verdicts[name])]
             if not unworthy:
                 return names, verdicts
@@ -350,8 +352,6 @@ class _Trial:
         model = self._model(names)
         if name == "offset":
             return self._ground.borne_out(model, verdict) or self._ground.certain(model, verdict)
-        if name == "interreflection" and self._told_by_hues:
-            return True
         return worth(name, verdict, model) and (name != "gain" or self._gain_is_plain(names))
 
     def _no_uneven_bounce(self, names: frozenset[str]) -> bool:
