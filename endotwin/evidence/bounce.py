@@ -77,8 +77,8 @@ class Surroundings:
         return light, self._probe.direct_light(hypothesis, PRIOR["n"], PRIOR["q"])
 
     def _albedo(self, light: BouncedLight, direct: np.ndarray, brightest: float) -> Albedo:
-        """That of patches where the brightest tissue has that albedo, and ``direct`` [N] comes from the
-        ``light`` itself."""
+        """That of patches, the brightest of them ``brightest``, if ``direct`` [N] comes from the ``light``
+        itself."""
         there = direct
         for _ in range(FIXED_POINT_ROUNDS):
             base_color = _patch_albedo(self._linear, there, self._patch, self._radiosity.count, brightest)
@@ -87,7 +87,7 @@ class Surroundings:
         return albedo
 
     def _under(self, light: BouncedLight, direct: np.ndarray, brightest: float) -> Bounced:
-        """The bounce off patches of which the brightest have that albedo. Arguments as of ``_albedo``."""
+        """The bounce off patches of such albedo. Arguments as of ``_albedo``."""
         n, q, albedo = PRIOR["n"], PRIOR["q"], self._albedo(light, direct, brightest)
         found = light.expanded(self._places, n, q, albedo, by=("n", "q"))
         seen = self._seen(found.irradiance(n, q).numpy(), albedo.base_color)

@@ -414,7 +414,7 @@ class _Trial:
             reason = f"bounced light that is a little off would explain as much ({verdict})"
         elif verdict is not None:
             hardly = "hardly predicts" if verdict.gain_db > 0 else "does not predict"
-            hues = f"; hues {self._hues}" if name == "interreflection" and self._hues else ""
+            hues = f"; hues {self._hues}" if name == "interreflection" and self._hues is not None else ""
             reason = f"{hardly} held-out pixels better ({verdict}{hues})"
         else:
             known = {

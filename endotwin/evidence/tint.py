@@ -1,7 +1,7 @@
 """Whether light bounces: what the hue of a place says as the light on it changes.
 
 White light makes a place brighter or darker and leaves the ratios of its channels; what tissue throws is of
-tissue's color, and turns the hue of a place the more, the less of its light is the lamp's own. Whatever else
+tissue's colour, and turns the hue of a place the more, the less of its light is the lamp's own. Whatever else
 a model of the light errs by, where guides stand, how fast light falls off, how strong a photo's gain is,
 changes all channels alike: it neither passes for a bounce, nor hides one. What does turn hues is a tone curve
 (see ``tone``).
