@@ -26,7 +26,7 @@ from endotwin.evidence.sightings import Sightings
 from endotwin.evidence.verdict import Halved, Verdict, compared, verdict_of
 from endotwin.light.forward import Lit
 from endotwin.light.guides import AT_LENS, COSINE, guided, log_axis
-from endotwin.pixels.fixed_effects import Design, FixedEffects, Left, pseudo_huber, regress
+from endotwin.pixels.fixed_effects import Design, FixedEffects, Left, pseudo_huber, regress, without_means
 from endotwin.pixels.samples import Samples, whole_groups
 from endotwin.pixels.start import LIGHT_MEAN, LIGHT_SPREAD, PRIOR, VIGNETTING_SPREAD, dark, diffuse
 
@@ -257,13 +257,10 @@ class Probe(Sightings):
 
     def smooth_colors(self, found: Fitted) -> np.ndarray:
         """Display values [N, 3] as ``found`` has the pixels' brightness, each place of one hue."""
-        color = self.shown_colors
-        hue = np.log(color) - np.log(color.mean(axis=1, keepdims=True))
-        sums = np.stack([np.bincount(self.vertex, each, self.count) for each in hue.T], axis=1)
-        count = np.maximum(np.bincount(self.vertex, minlength=self.count), 1)
-        log_color = (self._intercepts(found)[:, None] + sums / count[:, None])[self.vertex]
-        light = found.design.explained(found.effects)[:, None]
-        return np.clip(np.exp(light + log_color), LEVEL, 1)
+        log_color = np.log(self.shown_colors)
+        left = log_color - found.design.explained(found.effects)[:, None]
+        left = without_means(left, np.ones(len(self)), self.vertex, self.count)
+        return np.clip(np.exp(log_color - left), LEVEL, 1)
 
     def _intercepts(self, found: Fitted) -> np.ndarray:
         """What is left of ln C at each vertex, [count]."""

@@ -16,8 +16,8 @@ from endotwin.effects.noise import LEVEL
 from endotwin.effects.tone import bend
 from endotwin.evidence.probe import Fitted, Probe
 from endotwin.evidence.tone import RATIO_ERROR, RATIOS
-from endotwin.evidence.verdict import Halved, Verdict, compared
-from endotwin.pixels.fixed_effects import Design, regress
+from endotwin.evidence.verdict import Verdict, predicts_better
+from endotwin.pixels.fixed_effects import Design
 
 
 def turned(probe: Probe, model: Fitted, log_colors: np.ndarray) -> Verdict:
@@ -41,5 +41,4 @@ def turned(probe: Probe, model: Fitted, log_colors: np.ndarray) -> Verdict:
         return Design(stacked, place, count, weight=1 / variance.ravel(), positive=positive)
 
     plain, bounced = design(bent, positive=0), design(bounce, bent, positive=1)
-    without, beside = (Halved.of(target.ravel(), each, half) for each in (plain, bounced))
-    return compared(without, beside, regress(target.ravel(), plain).width)
+    return predicts_better(target.ravel(), plain, bounced, half)

@@ -17,7 +17,7 @@ import numpy as np
 from endotwin.effects import Decision
 from endotwin.effects.tone import Tone
 from endotwin.evidence.coat import LEAST_SIGHTINGS
-from endotwin.evidence.verdict import MIN_SIGMAS, Halved, Verdict, compared
+from endotwin.evidence.verdict import MIN_SIGMAS, Verdict, predicts_better
 from endotwin.pixels.fixed_effects import Design, regress
 
 RATIOS = np.array([[1.0, -1.0, 0.0], [0.5, 0.5, -1.0]])
@@ -125,5 +125,4 @@ def _verdict(hues: Hues, passing: int) -> Verdict:
         return Verdict(0.0, 0.0)
     plain, bent = hues.design(passing, curve=False), hues.design(passing)
     half = (np.random.default_rng(0).random(plain.count) < 0.5)[plain.group]
-    without, beside = (Halved.of(hues.residual, design, half) for design in (plain, bent))
-    return compared(without, beside, regress(hues.residual, plain).width)
+    return predicts_better(hues.residual, plain, bent, half)

@@ -89,6 +89,13 @@ def compared(base: Halved, other: Halved, width: float) -> Verdict:
     return verdict_of(np.bincount(design.group, before - after, design.count), float(after.sum()))
 
 
+def predicts_better(target: np.ndarray, plain: Design, other: Design, half: np.ndarray) -> Verdict:
+    """How much better the design ``other`` explains values [N] than ``plain``, of groups that did not choose
+    the coefficients; ``half``: bool [N], of whole groups, which each choose for the rest."""
+    base, beside = (Halved.of(target, design, half) for design in (plain, other))
+    return compared(base, beside, regress(target, plain).width)
+
+
 def verdict_of(gained: np.ndarray, after: float) -> Verdict:
     """The verdict on losses that groups [G] lost by ``gained``, to ``after`` in all."""
     sigma = max(math.sqrt(float((gained**2).sum())), 1e-30)
