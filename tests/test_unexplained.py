@@ -1,7 +1,5 @@
 """Whether a fit tells that it leaves more of the photos than their noise."""
 
-import re
-
 import cv2
 import numpy as np
 import pytest
@@ -40,10 +38,6 @@ def test_what_is_left_beyond_the_noise_is_told_with_its_suspect(noisy):
     assert "12.0 of 255 levels" in said and "4 times" in said and "suspect gain" in said
 
 
-def less_red(photo: np.ndarray) -> np.ndarray:
-    return photo * [1, 1, 0.85]
-
-
 def blurred(photo: np.ndarray) -> np.ndarray:
     return cv2.GaussianBlur(photo, (0, 0), 4)
 
@@ -58,15 +52,13 @@ def test_photos_that_are_not_like_the_others_are_named_and_clean_ones_are_not(tm
     folder = tube_sequence.write(tmp_path / "tube", 16, 96, 72)
     endotwin.fit_twin(endotwin.fuse_twin(folder), align="off")
     assert "--without" not in caplog.text
-    for index, spoil in {3: blurred, 5: less_red, 11: smeared}.items():
+    for index, spoil in {3: blurred, 11: smeared}.items():
         file = str(folder / f"{index:04d}_color.png")
         cv2.imwrite(file, np.rint(spoil(cv2.imread(file))).astype(np.uint8))
     endotwin.fit_twin(endotwin.fuse_twin(folder), align="off")
     (said,) = [record.message for record in caplog.records if "--without" in record.message]
-    assert "--without 3,5,11'" in said
+    assert "--without 3,11'" in said
     assert "is it blurred?" in said and "photo 11 departs from the fit" in said
-    percent = int(re.search("photo 5 is ([0-9]+) % less red", said)[1])
-    assert 9 <= percent <= 15  # the places' own colour takes a share, as the other photos outvote this one
 
 
 def remains(**off: np.ndarray) -> Remains:

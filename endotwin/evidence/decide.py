@@ -5,7 +5,7 @@ One effect can pass for another: a gain of each frame swallows most of a bounce 
 a guide. So where the light stands, whether it bounces and whether the camera's gain changes are decided
 together: of all combinations the one that predicts best, less what is not worth its place beside the rest.
 Profile and vignetting, which say little and nearly the same, follow beside what was kept. Only a bounce
-turns hues: where these tell of one, there is no set without it.
+turns hues: where these tell of one, there is no set without it, and where they rule it out, none with it.
 """
 
 from __future__ import annotations
@@ -33,10 +33,11 @@ from endotwin.evidence.glints import Glints
 from endotwin.evidence.guide_search import Ground, Guides, Search, found_guides, polished, settled
 from endotwin.evidence.log_light import Bounced
 from endotwin.evidence.probe import Fitted, Hypothesis, Probe
-from endotwin.evidence.tint import turned
+from endotwin.evidence.tint import Tints
 from endotwin.evidence.verdict import MIN_GAIN_DB, MIN_IMPOSSIBLE_DB, MIN_SIGMAS, Verdict
 from endotwin.evidence.worth import BARE, LEAST, more_usual, worth
 from endotwin.light.guides import AT_LENS, COSINE, EXPONENTIAL
+from endotwin.pixels.casts import Casts
 from endotwin.pixels.samples import Samples
 from endotwin.pixels.start import PRIOR
 from endotwin.surface.casting import Caster
@@ -44,6 +45,10 @@ from endotwin.twin import Twin
 
 TOGETHER = ("offset", "interreflection", "gain")
 BESIDE = ("profile", "vignetting")
+
+RULED_OUT_SIGMAS = 5.0
+"""By which hues have to be steadier without a little of a bounce than with it for there to be none: where
+there is none they are by 10 to 16, and where there is one less steady by 11 to 26."""
 
 SHOWN_GAIN = LEVEL / PRIOR["gamma"]
 """Standard deviation of ln gain that changes white by one of 255 levels: a smaller one no photo shows."""
@@ -57,11 +62,14 @@ class Decided:
         effects: those that are on, with parameters. decisions: of every fitted effect, by name.
         start: n, q and γ from which the fit starts instead of the closed form, which is right for a light at
             the lens alone; None where that is what it is.
+        casts: of photos of another white balance than the rest, without which all is decided; None: there
+            are none.
     """
 
     effects: Effects
     decisions: dict[str, Decision]
     start: tuple[float, float, float] | None
+    casts: Casts | None = None
 
 
 def decide(
@@ -81,13 +89,19 @@ def decide(
         late: whether guides are not to be sought a second time.
         near_mm: guides near which others are looked for first; the lens: none.
     """
-    probe = Probe(samples, twin, caster)
-    trial = _Trial(probe, glints, wanted, late, near_mm)
+
+    def trial_of(samples: Samples) -> _Trial:
+        return _Trial(Probe(samples, twin, caster), glints, wanted, late, near_mm)
+
+    trial = trial_of(samples)
+    casts = trial.casts()
+    if casts is not None:
+        trial = trial_of(casts.taken_off(samples))
     kept = trial.together()
     kept = trial.shadowed(kept)
     for name in trial.stronger_first(kept):
         kept = trial.beside(name, kept)
-    return trial.decided(trial.polished(trial.without_idle_gain(kept)))
+    return replace(trial.decided(trial.polished(trial.without_idle_gain(kept))), casts=casts)
 
 
 class _Trial:
@@ -110,7 +124,9 @@ class _Trial:
         self._guides_mm = {False: AT_LENS, True: AT_LENS}
 
     def wanted(self, name: str) -> str:
-        return self._wanted.get(name, "auto")
+        """As was asked for; what hues rule out is off."""
+        wanted = self._wanted.get(name, "auto")
+        return "off" if wanted == "auto" and name == "interreflection" and self._ruled_out else wanted
 
     def together(self) -> Fitted:
         """What remains of the best set of the effects that are decided together, each beside a vignetting
@@ -130,20 +146,34 @@ class _Trial:
         return self._probe.fit(replace(self._model(kept).hypothesis, vignetting=False))
 
     @cached_property
-    def _hues(self) -> Verdict | None:
-        """How much better light that bounces predicts held-out hues; None where that is not asked. Guides
-        hardly change it, so that it is told before they are sought."""
-        if self.wanted("interreflection") != "auto" or not len(self._probe):
-            return None
-        began = time.perf_counter()
-        model = self._probe.fit(Hypothesis(gain=self._tellable("gain", None)))
-        verdict = turned(self._probe, model, self._surroundings.log_colors(model.hypothesis))
-        self._seconds["interreflection"] += time.perf_counter() - began
-        return verdict
+    def _hues(self) -> tuple[Verdict, Verdict]:
+        """How much better light that bounces predicts held-out hues than none, and none than a little of it.
+        Guides hardly change it, so that it is told before they are sought."""
+        return self._tints.bounced(), self._tints.still()
 
     @property
     def _told_by_hues(self) -> bool:
-        return self._hues is not None and self._hues.worth(LEAST)
+        return self._asks_hues and self._hues[0].worth(LEAST)
+
+    @property
+    def _ruled_out(self) -> bool:
+        return self._asks_hues and self._hues[1].sigmas >= RULED_OUT_SIGMAS
+
+    @property
+    def _asks_hues(self) -> bool:
+        return self._wanted.get("interreflection", "auto") == "auto" and len(self._probe) > 0
+
+    @cached_property
+    def _tints(self) -> Tints:
+        began = time.perf_counter()
+        model = self._probe.fit(Hypothesis(gain=self._tellable("gain", None)))
+        tints = Tints(self._probe, model, self._surroundings.log_colors(model.hypothesis))
+        self._seconds["interreflection"] += time.perf_counter() - began
+        return tints
+
+    def casts(self) -> Casts | None:
+        """Photos of another white balance than the rest."""
+        return self._tints.casts() if len(self._probe) else None
 
     def _open(self, name: str) -> bool:
         """Whether brightness is to decide on an effect: nobody asked for it or forbade it, nor hues told."""
@@ -395,6 +425,10 @@ class _Trial:
         gain_db = None if verdict is None else round(verdict.gain_db, 3)
         if self.wanted(name) == "off":
             reason = "forced off"
+            if self._wanted.get(name) != "off":
+                still = self._hues[1]
+                reason = f"held-out hues are predicted better without the least of it ({still})"
+                gain_db = round(-still.gain_db, 3)
         elif on:
             forced = "forced on; " if self.wanted(name) == "on" else ""
             reason = f"{forced}predicts held-out pixels better by {verdict}"
@@ -403,7 +437,7 @@ class _Trial:
                     f"glints stand about guides, and no held-out pixels plainly contradict it ({verdict})"
                 )
             elif not forced and name == "interreflection" and self._told_by_hues:
-                reason = f"predicts held-out hues better by {self._hues}, and pixels by {verdict}"
+                reason = f"predicts held-out hues better by {self._hues[0]}, and pixels by {verdict}"
             elif not forced and name == "interreflection" and not verdict.worth(LEAST):
                 reason = (
                     f"beside it light and response are more usual; held-out pixels hardly tell ({verdict})"
@@ -414,7 +448,7 @@ class _Trial:
             reason = f"bounced light that is a little off would explain as much ({verdict})"
         elif verdict is not None:
             hardly = "hardly predicts" if verdict.gain_db > 0 else "does not predict"
-            hues = f"; hues {self._hues}" if name == "interreflection" and self._hues is not None else ""
+            hues = f"; hues {self._hues[0]}" if name == "interreflection" and self._asks_hues else ""
             reason = f"{hardly} held-out pixels better ({verdict}{hues})"
         else:
             known = {

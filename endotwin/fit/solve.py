@@ -102,8 +102,10 @@ def fit_twin(
     fit = _Fit(twin, caster.threaded(THREADS), pace, states, device)
     lighted = fit.light(pixels, start)
     relighting = lighted.relighting
+    if casts := lighted.decided.casts:
+        logger.warning("%s", casts)
     with stopwatch.stage("detail"):
-        samples = relighting.lit(samples)
+        samples = relighting.lit(lighted.samples)
         state, normals, remains = fit.detail(lighted, samples)
         state = extended(state, surface, samples)
         twin = replace(twin, surface=replace(surface, normals=normals))
@@ -123,13 +125,14 @@ def fit_twin(
             effects = effects.including(effect)
         fitted = _fitted(twin, wet.model.state, effects, decisions, wet.film)
         priced = price(fitted, fit.caster, samples.views)
-    sharpened = samples.views.processor
+    sharpened, casts = samples.views.processor, lighted.decided.casts
     return priced.with_record(
         fit={
             "method": "twin",
             "undetermined": list(lighted.start.undetermined),
             "sharpening_undone": sharpened
             and {"amount": sharpened.sharpening, "radius_px": sharpened.radius},
+            "casts_undone": casts and casts.to_dict(),
             **stopwatch.to_dict(),
         }
     )
@@ -196,10 +199,11 @@ def _of_some_vertices(vertex: np.ndarray, count: int, generator: np.random.Gener
 
 @dataclass(frozen=True)
 class _Lighted:
-    """The effects that are decided, where the fit started beside them, what they make of the light, what a
-    step cost, what is found, and the seconds that finding it again took."""
+    """The effects that are decided, the samples without casts, where the fit started beside them, what they
+    make of the light, what a step cost, what is found, and the seconds that finding it again took."""
 
     decided: Decided
+    samples: Samples
     start: Start
     relighting: Relighting
     cost: Cost
@@ -254,6 +258,9 @@ class _Fit:
         shown = samples if toned is None else samples.untoned(toned[0])
         with self.pace.stopwatch.stage("effects"):
             decided = self._decided(pixels, shown, start, near_mm) if anew else before.decided
+            if (casts := decided.casts) is not None:
+                shown = casts.taken_off(shown)
+                samples = casts.taken_off(samples, toned and toned[0])
             if decided.start is not None or toned is not None:
                 start = _start_beside(decided, shown[pixels.start], surface)
             faint = NOTHING
@@ -269,7 +276,7 @@ class _Fit:
             found = before and before.found
             stage = LightStage(*parts, surface, start, self.pace, relighting, wanted, self.device, found)
             self.pace.leave(stage.cost.detail_s(self._weights, len(samples), self.pace.plan.steps))
-            return _Lighted(decided, start, relighting, stage.cost, stage.found())
+            return _Lighted(decided, samples, start, relighting, stage.cost, stage.found())
 
     def _decided(self, pixels: _Pixels, shown: Samples, start: Start, near_mm: Guides) -> Decided:
         """The effects that photos which look as ``shown`` tell; guides are sought first ``near_mm``."""

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from endotwin.effects import Decision
 from endotwin.effects.noise import LEVEL, Noise
+from endotwin.pixels.casts import WIDTHS, told
 from endotwin.pixels.samples import Samples
 from endotwin.robust import NORMAL, robust_std
 from endotwin.sequence import Sequence
@@ -34,9 +35,6 @@ CAST, BLURRED, FAR = 0.05, 0.85, 2.0
 """A photo has another colour than the rest where a channel is off by so much (ln of display values): that
 alone keeps a photo of middle brightness below 37 dB, −20·log₁₀(0.05·0.5/√3). It is blurred where it shows
 less than this share of the detail, and amiss where it departs so many times as far from the fit."""
-
-WIDTHS = 5.0
-"""And only where it is off by so many times what the others are."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,11 +104,9 @@ def _cast(remains: Remains) -> Odd | None:
     if not len(odd):
         return None
     worst, channel = np.unravel_index(size.argmax(), size.shape)
-    change = np.expm1(off[worst, channel])
     return (
-        f"photo {remains.frames[worst]} is {100 * abs(change):.0f} % {'more' if change > 0 else 'less'} "
-        f"{('red', 'green', 'blue')[channel]} than the other photos of the same places (was the white "
-        "balance or the light another?)"
+        f"photo {remains.frames[worst]} is {told(off[worst, channel], channel)} than the other photos of the "
+        "same places (was the white balance or the light another?)"
     ), odd
 
 

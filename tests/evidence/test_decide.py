@@ -18,6 +18,7 @@ from endotwin.evidence.decide import _Trial, decide
 from endotwin.evidence.glints import Glints
 from endotwin.evidence.guide_search import Ground, _judged, _judged_another, found_guides
 from endotwin.evidence.probe import Hypothesis, Probe
+from endotwin.evidence.tint import Tints
 from endotwin.evidence.verdict import Verdict
 from endotwin.light.guides import AT_LENS
 from endotwin.pipeline import fuse_twin
@@ -31,6 +32,7 @@ pytestmark = pytest.mark.slow
 EXAMPLE = Path(__file__).parents[2] / "examples" / "colon_small"
 DATA = Path(os.environ.get("ENDOTWIN_DATA", "nowhere"))
 needs_data = pytest.mark.skipif(not DATA.is_dir(), reason="ENDOTWIN_DATA names no folder")
+NOTHING = Verdict(0.0, 0.0)
 LIGHT = ("offset", "shadows", "interreflection", "gain", "vignetting", "profile")
 
 
@@ -163,6 +165,7 @@ def test_guides_that_do_not_show_without_bounced_light_are_sought_beside_it(exam
 
     monkeypatch.setattr("endotwin.evidence.decide.found_guides", found)
     monkeypatch.setattr(Probe, "fit", fitted)
+    monkeypatch.setattr(Tints, "still", lambda tints: NOTHING)
     decide(samples, twin, caster, glints, {})
     beside = [each for each in sets if each.guides_mm != AT_LENS]
     assert {each.bounced is None for each in beside} == {False, True}
@@ -170,6 +173,20 @@ def test_guides_that_do_not_show_without_bounced_light_are_sought_beside_it(exam
     sets.clear()
     decide(samples, twin, caster, glints, {"interreflection": "off"})
     assert all(each.guides_mm == AT_LENS for each in sets)
+
+
+def test_nothing_is_tried_with_a_bounce_that_hues_rule_out(example, monkeypatch):
+    twin, caster, samples, glints = example
+    tried = []
+
+    def fitted(probe, hypothesis, fit=Probe.fit):
+        tried.append(hypothesis)
+        return fit(probe, hypothesis)
+
+    monkeypatch.setattr(Probe, "fit", fitted)
+    decision = decide(samples, twin, caster, glints, {}).decisions["interreflection"]
+    assert tried and all(each.bounced is None for each in tried)
+    assert decision.state == "off" and decision.gain_db < 0 and "hues" in decision.reason
 
 
 def test_an_effect_that_is_forced_off_stays_off(example):
@@ -337,6 +354,7 @@ def test_a_bounce_that_gains_make_up_for_is_told_by_how_usual_light_and_response
         return Verdict(more * gain_db, more * np.sign(gain_db) * 5, likelier=more * likelier)
 
     monkeypatch.setattr(Probe, "compare", compared)
+    monkeypatch.setattr(Tints, "still", lambda tints: NOTHING)
     wanted = {name: "off" for name in LIGHT if name != "interreflection"}
     trial = _Trial(Probe(samples, twin, caster), glints, wanted, lambda: False, AT_LENS)
     trial.together()
