@@ -223,7 +223,7 @@ def registered_wrongly(twin: Twin, folder: Path, twist: np.ndarray, intrinsics: 
     return true
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_hand_eye_error_is_found_and_held_out_photos_gain(fused, tmp_path):
     twist = np.r_[np.radians([0.1, -0.1, 0.07]), 0.2, -0.2, 0.15]
     true = registered_wrongly(fused(), tmp_path / "spoilt", twist, np.zeros(3))

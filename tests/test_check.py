@@ -258,7 +258,10 @@ def test_a_small_error_of_scale_costs_agreement_in_proportion(example):
     assert right < 1e-4 and far == pytest.approx(2 * near, rel=0.1)
 
 
-@pytest.mark.parametrize("sequence", ["colon_gi", "colon_offset", "colon_fisheye"])
+@pytest.mark.parametrize(
+    "sequence",
+    ["colon_offset", *(pytest.param(each, marks=pytest.mark.long) for each in ("colon_gi", "colon_fisheye"))],
+)
 def test_larger_sound_sequences_pass(data_root, sequence):
     assert named(data_root / sequence) == set()
 

@@ -30,6 +30,7 @@ def heldout(twin):
         yield renderer.view(sequence.T_world_camera[index]).color, sequence.frame(index).color / 255
 
 
+@pytest.mark.long
 def test_no_dots_remain_along_rims_in_the_held_out_renders_of_the_example(fitted):
     for render, photo in heldout(fitted):
         assert not dots(render, photo).any()

@@ -353,6 +353,7 @@ def test_colon_fisheye_fuses_within_a_twentieth_of_a_millimetre(data_root):
     assert mean_distance_mm(surface, data_root / "colon_fisheye" / "truth" / "colon.ply") < 0.05
 
 
+@pytest.mark.long
 def test_colon_direct_disagrees_with_few_pixels(data_root):
     sequence = open_sequence(data_root / "colon_direct")
     surface = fuse(sequence, frames=range(0, 64, 4))

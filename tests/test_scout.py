@@ -16,7 +16,7 @@ from endotwin.surface.casting import Caster
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("n", [1.2, 3.4])
+@pytest.mark.parametrize("n", [pytest.param(1.2, marks=pytest.mark.long), 3.4])
 def test_where_light_bounces_the_search_sets_out_from_a_shape_of_light_near_the_true_one(n):
     surface = tube_twin.seen(tube_twin.surface(fold_mm=2.0))
     twin = tube_twin.fitted(surface)

@@ -213,6 +213,7 @@ def test_a_study_does_not_go_on_with_a_network_of_other_widths(stopped, monkeypa
         stopped()
 
 
+@pytest.mark.long
 def test_a_study_does_not_go_on_from_frames_that_were_changed(stopped, other, tmp_path):
     changed = tmp_path / "changed"
     shutil.copytree(other, changed)

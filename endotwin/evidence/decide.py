@@ -48,7 +48,7 @@ BESIDE = ("profile", "vignetting")
 
 RULED_OUT_SIGMAS = 5.0
 """By which hues have to be steadier without a little of a bounce than with it for there to be none: where
-there is none they are by 10 to 16, and where there is one less steady by 11 to 26."""
+there is none they are by 5.5 to 16, and where there is one less steady by 11 to 28."""
 
 SHOWN_GAIN = LEVEL / PRIOR["gamma"]
 """Standard deviation of ln gain that changes white by one of 255 levels: a smaller one no photo shows."""

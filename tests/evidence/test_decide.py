@@ -125,6 +125,7 @@ def test_a_profile_that_is_no_cosine_is_found(example):
     assert decided.effects["profile"].exponential == pytest.approx(1, abs=0.1)
 
 
+@pytest.mark.long
 def test_a_profile_forced_on_a_cosine_stays_one(example):
     twin, caster, samples, glints = example
     decided = decide(samples, twin, caster, glints, {"profile": "on"})
