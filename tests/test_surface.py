@@ -3,9 +3,13 @@
 import numpy as np
 import pytest
 import trimesh
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
 from safetensors.numpy import save_file
 
 from endotwin.surface import Surface
+from endotwin.surface.cells import numbered
 
 FAR_MM = np.array([4e6, -7e6, 2e6])
 
@@ -91,3 +95,12 @@ def test_an_empty_mesh_is_a_surface():
     surface = Surface.from_mesh(np.zeros((0, 3)), np.zeros((0, 3), int), np.zeros((0, 3)))
     assert repr(surface) == "Surface(0 vertices, 0 triangles)"
     assert np.isfinite(surface.origin_mm).all()
+
+
+@given(arrays(np.int64, st.tuples(st.integers(0, 40), st.integers(1, 4)), elements=st.integers(-3, 3)))
+def test_cells_are_numbered_in_their_order_whatever_lies_in_them(cells):
+    number = numbered(cells)
+    expected = np.unique(cells, axis=0, return_inverse=True)[1].reshape(-1) if len(cells) else number
+    np.testing.assert_array_equal(number, expected)
+    far = numbered(cells * 2**40)
+    np.testing.assert_array_equal(far, number)

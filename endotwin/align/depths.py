@@ -24,6 +24,7 @@ from endotwin.sequence import Sequence
 from endotwin.sequence.spread import spread
 from endotwin.surface import Surface
 from endotwin.surface.casting import Caster
+from endotwin.surface.cells import numbered
 from endotwin.surface.vectors import dot, unit
 from endotwin.twin import Twin
 
@@ -142,7 +143,7 @@ def all_together(maps: list[_Beside], own: np.ndarray, cell_mm: float) -> np.nda
         for name in ("points_mm", "distance_mm", "slopes", "weight")
     )
     cells = np.floor(points / cell_mm).astype(np.int64)
-    place = np.unique(cells, axis=0, return_inverse=True)[1].reshape(-1)
+    place = numbered(cells)
     places = int(place.max()) + 1 if len(place) else 0
     pair, which = np.unique(frame * places + place, return_inverse=True)
     total = np.bincount(which, weight)
