@@ -18,6 +18,7 @@ import torch
 
 from endotwin.effects.noise import LEVEL
 from endotwin.effects.tone import bend
+from endotwin.evidence.coat import LEAST_SIGHTINGS
 from endotwin.evidence.probe import Fitted, Probe
 from endotwin.evidence.tone import RATIO_ERROR, RATIOS
 from endotwin.evidence.verdict import Halved, Verdict, compared, predicts_better
@@ -66,7 +67,8 @@ class Tints:
         any strength; None if there are none.
 
         What the bounce errs by turns the hues of photos, too, more and more along the camera's path. So a
-        photo has a cast if it stands out among all, by what either half of the places says.
+        photo has a cast if it stands out among all, by what either half of the places says, and enough of its
+        places are in others.
         """
         every = np.ones_like(self._half)
         if len(self.probe.frames) < 2:
@@ -74,6 +76,7 @@ class Tints:
         log, *by_half = (self._log_casts(part) for part in (every, self._half, ~self._half))
         told = np.min([np.sign(log) * each for each in by_half], axis=0)
         odd = (told > max(LEAST_CAST, WIDTHS * robust_std(log))).any(axis=1)
+        odd &= self._beside_others >= LEAST_SIGHTINGS
         if not odd.any():
             return None
         red, blue = log[odd].T
@@ -88,6 +91,13 @@ class Tints:
         found = regress(self._log_hues[part], design[part], count * len(RATIOS)).intercepts
         found = np.linalg.solve(RATIOS[:, [0, 2]], found.reshape(len(RATIOS), count)).T
         return found - np.median(found, axis=0)
+
+    @property
+    def _beside_others(self) -> np.ndarray:
+        """How many pixels of each photo are of a place that another shows, too, int [F]."""
+        vertex, frame, count = self.probe.vertex, self.probe.frame, len(self.probe.frames)
+        shown_by = np.bincount(np.unique(vertex * count + frame) // count, minlength=self.probe.count)
+        return np.bincount(frame[shown_by[vertex] > 1], minlength=count)
 
     @cached_property
     def _log_hues(self) -> np.ndarray:

@@ -121,6 +121,14 @@ def test_a_photo_of_which_few_pixels_tell_has_no_cast():
     assert Tints(part, None, log_colors[rows]).casts() is None
 
 
+def test_a_photo_that_shows_places_of_its_own_has_no_cast_whatever_the_first_photo_has():
+    probe, log_colors = photos(0.0, cast=casts(photo0=(-0.09, 0.0)))
+    alone = probe.frame == FRAMES - 1
+    probe.vertex = np.where(alone, probe.count, 0) + probe.vertex
+    probe.count *= 2
+    assert Tints(probe, None, log_colors).casts().frames.tolist() == [7]
+
+
 def test_a_single_photo_is_of_no_other_white_balance_than_itself():
     probe, log_colors = photos(0.0)
     one = SimpleNamespace(**{**vars(probe), "frames": probe.frames[:1], "frame": np.zeros_like(probe.frame)})
