@@ -142,8 +142,7 @@ def all_together(maps: list[_Beside], own: np.ndarray, cell_mm: float) -> np.nda
         np.concatenate([getattr(each, name) for each in maps])
         for name in ("points_mm", "distance_mm", "slopes", "weight")
     )
-    cells = np.floor(points / cell_mm).astype(np.int64)
-    place = numbered(cells)
+    place = numbered(np.floor(points / cell_mm).astype(np.int64))
     places = int(place.max()) + 1 if len(place) else 0
     pair, which = np.unique(frame * places + place, return_inverse=True)
     total = np.bincount(which, weight)

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import lru_cache
+from functools import lru_cache, partial
 
 import numpy as np
 import torch
 
-from endotwin.evidence.guide_search import Guides
 from endotwin.evidence.log_light import Bounced
 from endotwin.evidence.probe import Hypothesis, Probe
 from endotwin.light.bounced import Albedo, BouncedLight, Places
@@ -48,7 +47,7 @@ class Surroundings:
         lobes = Lobes(F0_DIELECTRIC)
         self._glossy = np.full((radiosity.count, 1), lobes.glossy_albedo(roughness))
         self._gloss = lobes.gloss(samples.cos, roughness)[:, 0].numpy()
-        self._light = lru_cache(1)(self._under_lamps)
+        self._light = lru_cache(1)(partial(BouncedLight, radiosity, probe.T_local_camera))
 
     def bounced(self, hypothesis: Hypothesis) -> Bounced:
         """Indirect light at the pixels, with n, q and γ at their priors.
@@ -77,9 +76,6 @@ class Surroundings:
         """What throws light, and the irradiance [N] that comes from there itself."""
         direct = self._probe.direct_light(hypothesis, PRIOR["n"], PRIOR["q"])
         return self._light(hypothesis.guides_mm, hypothesis.profile), direct
-
-    def _under_lamps(self, guides_mm: Guides, profile: float) -> BouncedLight:
-        return BouncedLight(self._radiosity, self._probe.T_local_camera, guides_mm, profile)
 
     def _albedo(self, light: BouncedLight, direct: np.ndarray, brightest: float) -> Albedo:
         """That of patches, the brightest of them ``brightest``, if ``direct`` [N] comes from the ``light``

@@ -145,19 +145,13 @@ class _Trial:
             self._say(name, name in kept, verdicts.get(name) or self._beside_kept(name, kept))
         return self._probe.fit(replace(self._model(kept).hypothesis, vignetting=False))
 
-    @cached_property
-    def _hues(self) -> tuple[Verdict, Verdict]:
-        """How much better light that bounces predicts held-out hues than none, and none than a little of it.
-        Guides hardly change it, so that it is told before they are sought."""
-        return self._tints.bounced(), self._tints.still()
-
     @property
     def _told_by_hues(self) -> bool:
-        return self._asks_hues and self._hues[0].worth(LEAST)
+        return self._asks_hues and self._tints.bounced.worth(LEAST)
 
     @property
     def _ruled_out(self) -> bool:
-        return self._asks_hues and self._hues[1].sigmas >= RULED_OUT_SIGMAS
+        return self._asks_hues and self._tints.still.sigmas >= RULED_OUT_SIGMAS
 
     @property
     def _asks_hues(self) -> bool:
@@ -165,6 +159,7 @@ class _Trial:
 
     @cached_property
     def _tints(self) -> Tints:
+        """Hues, which guides hardly change, so that they are asked before those are sought."""
         began = time.perf_counter()
         model = self._probe.fit(Hypothesis(gain=self._tellable("gain", None)))
         tints = Tints(self._probe, model, self._surroundings.log_colors(model.hypothesis))
@@ -423,12 +418,12 @@ class _Trial:
     def _say(self, name: str, on: bool, verdict: Verdict | None) -> None:
         """Note what was decided, and why."""
         gain_db = None if verdict is None else round(verdict.gain_db, 3)
-        if self.wanted(name) == "off":
+        if name == "interreflection" and self._ruled_out:
+            still = self._tints.still
+            reason = f"held-out hues are predicted better without the least of it ({still})"
+            gain_db = round(-still.gain_db, 3)
+        elif self.wanted(name) == "off":
             reason = "forced off"
-            if self._wanted.get(name) != "off":
-                still = self._hues[1]
-                reason = f"held-out hues are predicted better without the least of it ({still})"
-                gain_db = round(-still.gain_db, 3)
         elif on:
             forced = "forced on; " if self.wanted(name) == "on" else ""
             reason = f"{forced}predicts held-out pixels better by {verdict}"
@@ -437,7 +432,7 @@ class _Trial:
                     f"glints stand about guides, and no held-out pixels plainly contradict it ({verdict})"
                 )
             elif not forced and name == "interreflection" and self._told_by_hues:
-                reason = f"predicts held-out hues better by {self._hues[0]}, and pixels by {verdict}"
+                reason = f"predicts held-out hues better by {self._tints.bounced}, and pixels by {verdict}"
             elif not forced and name == "interreflection" and not verdict.worth(LEAST):
                 reason = (
                     f"beside it light and response are more usual; held-out pixels hardly tell ({verdict})"
@@ -448,7 +443,7 @@ class _Trial:
             reason = f"bounced light that is a little off would explain as much ({verdict})"
         elif verdict is not None:
             hardly = "hardly predicts" if verdict.gain_db > 0 else "does not predict"
-            hues = f"; hues {self._hues[0]}" if name == "interreflection" and self._asks_hues else ""
+            hues = f"; hues {self._tints.bounced}" if name == "interreflection" and self._asks_hues else ""
             reason = f"{hardly} held-out pixels better ({verdict}{hues})"
         else:
             known = {

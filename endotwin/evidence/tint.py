@@ -31,7 +31,8 @@ FAINT = 0.1
 than twice as much."""
 
 LEAST_CAST = 0.02
-"""What a bounce errs by turns the hues of single photos by up to 0.015, and less costs next to nothing."""
+"""Where photos hardly vary otherwise, what a bounce errs by turns single ones by up to 0.016; and less costs
+next to nothing."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,6 +48,7 @@ class Tints:
     model: Fitted
     log_colors: np.ndarray
 
+    @cached_property
     def bounced(self) -> Verdict:
         """How much better hues of places that did not choose its strength are predicted by bounced light,
         beside a tone curve of any contrast."""
@@ -54,6 +56,7 @@ class Tints:
         plain, other = self._design(curve), self._design(bounce, curve, positive=1)
         return predicts_better(self._log_hues, plain, other, self._half)
 
+    @cached_property
     def still(self) -> Verdict:
         """How much better hues are predicted without bounced light than with a FAINT share of it, beside a
         tone curve that the other half of the places chose."""

@@ -166,7 +166,7 @@ def test_guides_that_do_not_show_without_bounced_light_are_sought_beside_it(exam
 
     monkeypatch.setattr("endotwin.evidence.decide.found_guides", found)
     monkeypatch.setattr(Probe, "fit", fitted)
-    monkeypatch.setattr(Tints, "still", lambda tints: NOTHING)
+    monkeypatch.setattr(Tints, "still", NOTHING)
     decide(samples, twin, caster, glints, {})
     beside = [each for each in sets if each.guides_mm != AT_LENS]
     assert {each.bounced is None for each in beside} == {False, True}
@@ -355,7 +355,7 @@ def test_a_bounce_that_gains_make_up_for_is_told_by_how_usual_light_and_response
         return Verdict(more * gain_db, more * np.sign(gain_db) * 5, likelier=more * likelier)
 
     monkeypatch.setattr(Probe, "compare", compared)
-    monkeypatch.setattr(Tints, "still", lambda tints: NOTHING)
+    monkeypatch.setattr(Tints, "still", NOTHING)
     wanted = {name: "off" for name in LIGHT if name != "interreflection"}
     trial = _Trial(Probe(samples, twin, caster), glints, wanted, lambda: False, AT_LENS)
     trial.together()

@@ -47,7 +47,7 @@ def photos(
 def test_light_of_the_colour_of_tissue_shows_in_hues_under_any_tone_curve(strength, contrast):
     probe, log_colors = photos(strength, contrast)
     tints = Tints(probe, None, log_colors)
-    assert tints.bounced().worth(LEAST) and tints.bounced().sigmas > 10 and tints.still().sigmas < -10
+    assert tints.bounced.worth(LEAST) and tints.bounced.sigmas > 10 and tints.still.sigmas < -10
 
 
 @pytest.mark.parametrize("contrast", [0.0, 0.4])
@@ -55,12 +55,12 @@ def test_light_of_the_colour_of_tissue_shows_in_hues_under_any_tone_curve(streng
 def test_white_light_of_any_brightness_tells_of_no_bounce_whatever_the_tone_curve(contrast, seed):
     probe, log_colors = photos(0.0, contrast, seed)
     tints = Tints(probe, None, log_colors)
-    assert not tints.bounced().worth(LEAST) and tints.still().sigmas > RULED_OUT_SIGMAS
+    assert not tints.bounced.worth(LEAST) and tints.still.sigmas > RULED_OUT_SIGMAS
 
 
 def test_light_of_the_other_colour_is_no_bounce():
     probe, log_colors = photos(1.0)
-    assert not Tints(probe, None, log_colors[:, ::-1]).bounced().worth(LEAST)
+    assert not Tints(probe, None, log_colors[:, ::-1]).bounced.worth(LEAST)
 
 
 def test_grey_photos_tell_nothing_of_a_bounce():
@@ -69,10 +69,10 @@ def test_grey_photos_tell_nothing_of_a_bounce():
     probe.smooth_colors = lambda model: probe.shown_colors
     for light in (log_colors, np.repeat(log_colors[:, :1], 3, axis=1)):
         tints = Tints(probe, None, light)
-        verdict = tints.bounced()
+        verdict = tints.bounced
         assert np.isfinite([verdict.gain_db, verdict.sigmas]).all() and not verdict.worth(LEAST)
         assert tints.casts() is None
-    assert abs(tints.still().sigmas) < 1
+    assert abs(tints.still.sigmas) < 1
 
 
 def casts(**of: tuple[float, float]) -> np.ndarray:
