@@ -120,7 +120,7 @@ class _Trial:
         self._decisions: dict[str, Decision] = {}
         self._seconds = dict.fromkeys((*TOGETHER, *BESIDE), 0.0)
         self._model, self._bouncing = cache(self._fitted), cache(self._bounced)
-        self._with, self._gain_is_plain = cache(self._fitted_with), cache(self._no_uneven_bounce)
+        self._with, self._gain_is_plain = cache(self._fitted_with), cache(self._no_erring_bounce)
         self._guides_mm = {False: AT_LENS, True: AT_LENS}
 
     def wanted(self, name: str) -> str:
@@ -311,7 +311,7 @@ class _Trial:
         }
         effects = self._effects(kept)
         if "interreflection" in effects:
-            return Decided(effects, decisions, (PRIOR["n"], PRIOR["q"], PRIOR["gamma"]))
+            return Decided(effects, decisions, (kept.start[0], PRIOR["q"], PRIOR["gamma"]))
         plain = not set(effects) - {"specular"}
         return Decided(effects, decisions, None if plain else kept.start)
 
@@ -379,14 +379,19 @@ class _Trial:
             return self._ground.borne_out(model, verdict) or self._ground.certain(model, verdict)
         return worth(name, verdict, model) and (name != "gain" or self._gain_is_plain(names))
 
-    def _no_uneven_bounce(self, names: frozenset[str]) -> bool:
-        """Whether the gain among ``names`` explains more than bounced light of another strength in each frame
-        would: that from a mesh of what was seen errs so, by less where less of a pixel's light is bounced."""
+    def _no_erring_bounce(self, names: frozenset[str]) -> bool:
+        """Whether the gain among ``names`` explains more than bounced light that errs, as that from a mesh of
+        what was seen does, by less where less of a pixel's light is bounced: more than one of another
+        strength in each frame, or plainly more than all that changes along the path, which no bounce's error
+        does from one frame to the next."""
         without = self._model(names - {"gain"}).hypothesis
         if without.bounced is None:
             return True
         uneven = self._probe.fit(replace(without, uneven=True))
-        return self._probe.compare(uneven, self._model(names)).sigmas >= MIN_SIGMAS
+        if self._probe.compare(uneven, self._model(names)).sigmas >= MIN_SIGMAS:
+            return True
+        adrift, flickering = (self._probe.fit(replace(without, adrift=True, gain=on)) for on in (False, True))
+        return self._probe.compare(adrift, flickering).keep
 
     def _verdict(self, without: frozenset[str], names: frozenset[str]) -> Verdict:
         return self._probe.compare(self._model(without), self._model(names))

@@ -47,8 +47,8 @@ ALBEDO_RANGE = 5.0
 """Albedos are told to within this factor of the median: enough for how much their lobes stand out."""
 
 UNEVEN_SPREAD = 0.3
-"""Prior of ln of a frame's own bounce: what it was found to err by between frames is a tenth of that at most,
-so that the photos tell it."""
+"""Prior of ln of a frame's own bounce, and of what drifts along the path: what a bounce was found to err by
+between frames is a third of that at most, so that the photos tell it."""
 
 HELD = 1e-6
 """Spread of what is not to move."""
@@ -72,7 +72,7 @@ class Hypothesis:
 
     Attributes:
         uneven: whether bounced light is of another strength in each frame, as no scene's is, but what stands
-            for it may be.
+            for it may be. adrift: whether its strength, and that of all light, change along the path.
     """
 
     guides_mm: tuple[tuple[float, float, float], ...] = AT_LENS
@@ -82,6 +82,7 @@ class Hypothesis:
     vignetting: bool = False
     bounced: Bounced | None = None
     uneven: bool = False
+    adrift: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -280,12 +281,12 @@ class Probe(Sightings):
         mean, spread = [*LIGHT_MEAN, *moved], [*LIGHT_SPREAD, *spread]
         if hypothesis.vignetting:
             mean, spread = [*mean, 0.0], [*spread, VIGNETTING_SPREAD]
-        if hypothesis.uneven:
-            count = len(self.frames)
-            mean, spread = [*mean, *[0.0] * count], [*spread, *[PRIOR["gamma"] * UNEVEN_SPREAD] * count]
+        columns = _columns(self, hypothesis, light, about)
+        by_frame = columns.shape[1] - len(mean)
+        mean, spread = [*mean, *[0.0] * by_frame], [*spread, *[PRIOR["gamma"] * UNEVEN_SPREAD] * by_frame]
         precision = self.pixels_a_place / np.square(spread)
         return Design(
-            _columns(self, hypothesis, light, about),
+            columns,
             self.vertex,
             self.count,
             self.frame if hypothesis.gain else None,
@@ -295,12 +296,15 @@ class Probe(Sightings):
 
 
 def _columns(sightings: Sightings, hypothesis: Hypothesis, light: LogLight, about: About) -> np.ndarray:
-    """Those of the light, of vignetting, and of each frame's bounce, where there are any."""
+    """Those of the light, of vignetting, of each frame's bounce, and of what drifts, where there are any."""
     columns, by_bounce = np.split(light.columns(about, sightings.vertex), [LIGHT_COLUMNS], axis=1)
     if hypothesis.vignetting:
         columns = np.c_[columns, sightings.vignetting_column]
     if hypothesis.uneven:
         columns = np.c_[columns, by_bounce * (sightings.frame[:, None] == np.arange(len(sightings.frames)))]
+    if hypothesis.adrift:
+        drifts = sightings.drifts[sightings.frame]
+        columns = np.c_[columns, drifts, by_bounce * drifts]
     return columns
 
 

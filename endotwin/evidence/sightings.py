@@ -17,6 +17,14 @@ if TYPE_CHECKING:
     from endotwin.twin import Twin
 
 
+DRIFT = 0.5
+"""What comes from all around changes little while the tip and what it looks at move by less than this share
+of the median viewing distance, root mean square."""
+
+LEAST_DRIFT = 1e-2
+"""Variance, of one a frame, below which a function of the path is left out."""
+
+
 class Sightings:
     """N pixels and the vertices that they show.
 
@@ -45,6 +53,19 @@ class Sightings:
         """Poses of ``frames`` in the surface's frame, float64 [F, 4, 4]."""
         views = self.samples.views
         return views.T_local_camera[np.searchsorted(views.frames, self.frames)]
+
+    @cached_property
+    def drifts(self) -> np.ndarray:
+        """Functions of the frame that change smoothly along the path, [F, R]: with coefficients of variance 1
+        they make a Gaussian process of variance 1 (principal components of its covariance)."""
+        distance_mm, T = self.samples.distance_mm, self.T_local_camera
+        tips_mm = T[:, :3, 3]
+        ways_mm = np.stack([tips_mm, tips_mm + distance_mm * T[:, :3, 2]])
+        apart = np.linalg.norm(ways_mm[:, :, None] - ways_mm[:, None], axis=-1) / distance_mm
+        covariance = np.exp(-np.square(apart).mean(axis=0) / (2 * DRIFT**2))
+        variances, functions = np.linalg.eigh(covariance)
+        kept = variances > LEAST_DRIFT
+        return functions[:, kept] * np.sqrt(variances[kept])
 
     @cached_property
     def points_mm(self) -> np.ndarray:

@@ -65,24 +65,58 @@ def test_a_rough_lobe_bends_no_light_and_passes_for_no_other_effect(example, rou
     assert not probe.compare(plain, probe.fit(Hypothesis(vignetting=True))).worth(LEAST)
 
 
+def exposed(probe: Probe, even: Hypothesis, log_gain: np.ndarray, log_bounce: np.ndarray) -> Probe:
+    """The probe of a Lambertian wall under ``even`` light, all of which, or its bounce, is off by so much in
+    each frame [F]."""
+    rng, light = np.random.default_rng(2), log_light(probe, even)
+    albedo = rng.normal(0, 0.2, probe.count)[probe.vertex]
+    direct, bounced = light.irradiance(2, 2), np.exp(light.bounced.log)
+    lit = copy.copy(probe)
+    log_lit = np.log(direct + bounced * np.exp(log_bounce[probe.frame])) + log_gain[probe.frame]
+    lit.target = (albedo + log_lit) / 2.2 + rng.normal(0, 0.01, len(probe))
+    return lit
+
+
 def test_a_gain_and_a_bounce_that_errs_from_frame_to_frame_are_told_apart(example):
     """As strong as they pass for each other: each is the better model of what it made itself."""
     even = Hypothesis(bounced=Surroundings(example).bounced(Hypothesis()))
-    rng, light = np.random.default_rng(2), log_light(example, even)
-    albedo = rng.normal(0, 0.2, example.count)
-    direct, bounced = light.irradiance(2, 2), np.exp(light.bounced.log)
-    wander = np.sin(np.arange(len(example.frames)))[example.frame]
+    wander = np.sin(np.arange(len(example.frames)))
 
     def verdict(log_gain: float, log_bounce: float) -> Verdict:
-        lit = copy.copy(example)
-        log_lit = np.log(direct + bounced * np.exp(log_bounce * wander)) + log_gain * wander
-        lit.target = (albedo[example.vertex] + log_lit) / 2.2 + rng.normal(0, 0.01, len(example))
+        lit = exposed(example, even, log_gain * wander, log_bounce * wander)
         gain, uneven = (lit.fit(replace(even, **{name: True})) for name in ("gain", "uneven"))
         assert lit.compare(lit.fit(even), gain).keep
         return lit.compare(uneven, gain)
 
     assert verdict(log_gain=0.04, log_bounce=0).sigmas > MIN_SIGMAS
     assert verdict(log_gain=0, log_bounce=0.15).sigmas < -MIN_SIGMAS
+
+
+def test_a_gain_that_flickers_is_told_beside_all_that_drifts_along_the_path_and_what_drifts_is_none(example):
+    even = Hypothesis(bounced=Surroundings(example).bounced(Hypothesis()))
+    frames = np.arange(len(example.frames))
+
+    def verdict(log_gain: np.ndarray, log_bounce: np.ndarray) -> Verdict:
+        lit = exposed(example, even, log_gain, log_bounce)
+        assert lit.compare(lit.fit(even), lit.fit(replace(even, gain=True))).keep
+        adrift = replace(even, adrift=True)
+        return lit.compare(lit.fit(adrift), lit.fit(replace(adrift, gain=True)))
+
+    flicker, drift = 0.03 * (-1.0) ** frames, 0.3 * (frames / frames[-1] - 0.5)
+    assert verdict(log_gain=flicker, log_bounce=0 * drift).keep
+    assert verdict(log_gain=flicker, log_bounce=drift).keep
+    assert verdict(log_gain=0 * flicker, log_bounce=drift).gain_db < LEAST.gain_db
+    assert verdict(log_gain=drift, log_bounce=0 * drift).gain_db < LEAST.gain_db
+
+
+def test_drifts_are_of_variance_one_and_as_alike_as_frames_are_near(example):
+    drifts, T = example.drifts, example.T_local_camera
+    covariance = drifts @ drifts.T
+    assert np.diag(covariance) == pytest.approx(1, abs=0.05)
+    apart_mm = np.linalg.norm(T[:, None, :3, 3] - T[None, :, :3, 3], axis=-1)
+    first = covariance[0][np.argsort(apart_mm[0])]
+    assert (np.diff(first) < 0.05).all()
+    assert first[-1] < 0.9
 
 
 @pytest.mark.parametrize(
