@@ -2,12 +2,14 @@
 
     pip install mitsuba    # and LLVM 16 or later, which DRJIT_LIBLLVM_PATH names where it is not found
     python benchmarks/path_tracer.py 2 4 7 -o scenes
+    python benchmarks/path_tracer.py --kind wet 905 -o scenes
 
 Colon and path are those of examples/make_colon_small.py. Light guides, bounces to the sixteenth, a clear
 coat, vignetting, a gain that meters each photo, defocus, noise, and what a video processor does to a photo,
 tone curve, sharpening, chroma at half size and JPEG, each come by chance; so do poses that err as a
-registration does, with depth of the true surface there. ``truth/made.json`` says what a scene has. Of
-endotwin there is nothing in it but the casting of depth maps. A scene takes some ten minutes.
+registration does, with depth of the true surface there. All scenes of a ``--kind`` have the same few of
+these, and only colon and path from their seed. ``truth/made.json`` says what a scene has. Of endotwin there
+is nothing in it but the casting of depth maps. A scene takes some ten minutes.
 """
 
 from __future__ import annotations
@@ -17,7 +19,7 @@ import json
 import shutil
 import sys
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -121,6 +123,11 @@ class Draw:
             start_mm=number(10, 30),
         )
 
+    @classmethod
+    def of_kind(cls, kind: str, seed: int) -> Draw:
+        drawn = cls.of(seed)
+        return replace(KINDS[kind], seed=seed, shape=drawn.shape, start_mm=drawn.start_mm)
+
     @property
     def effects(self) -> list[str]:
         """endotwin's names of what the scene has."""
@@ -129,6 +136,40 @@ class Draw:
         there |= {"vignetting": self.vignetting, "coat": self.coat, "tone": self.tone}
         return [name for name, value in there.items() if value]
 
+
+PLAIN = Draw(
+    seed=0,
+    shape={},
+    tint=[1.0, 1.0, 1.0],
+    lens=Lens.omni(270),
+    guides_mm=GUIDES_MM[1],
+    n=2.0,
+    bounces=0,
+    gain=False,
+    vignetting=0.0,
+    coat=0.0,
+    gloss=0.9,
+    defocus=0.0,
+    noise=1.0,
+    tone=0.0,
+    sharpened=0.0,
+    chroma=False,
+    jpeg=0,
+    registered=False,
+    frames=22,
+    step_mm=0.9,
+    start_mm=0.0,
+)
+SCOPE = replace(PLAIN, guides_mm=GUIDES_MM[3], n=1.4, vignetting=0.2, gain=True, noise=1.5)
+PROCESSED = replace(PLAIN, sharpened=0.5, tone=0.35, jpeg=88)
+KINDS = {
+    "bounce": replace(PLAIN, lens=Lens.pinhole(400, 300, 80), bounces=5),
+    "processed": replace(PROCESSED, lens=Lens.pinhole(640, 480, 80), frames=30, step_mm=0.7),
+    "film": replace(SCOPE, bounces=16, coat=1.5, gloss=0.97, frames=26, step_mm=0.8),
+    "wet": replace(SCOPE, lens=Lens.omni(405), coat=2.0, gloss=0.99, frames=28, step_mm=0.4),
+}
+"""Light of four bounces; photos of a processor; a scope in a colon with a film of water; wet walls without
+bounces."""
 
 SHAPE = {
     "radius_mm": (9, 16),
@@ -325,10 +366,12 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("seeds", type=int, nargs="+")
+    parser.add_argument("--kind", choices=KINDS, default="", help="rather than what each seed draws")
     parser.add_argument("-o", "--output", type=Path, required=True, help="where each makes a folder")
     options = parser.parse_args()
     for seed in options.seeds:
-        folder, drawn = options.output / f"{seed:04d}", Draw.of(seed)
+        folder = options.output / f"{options.kind}{seed:04d}"
+        drawn = Draw.of_kind(options.kind, seed) if options.kind else Draw.of(seed)
         if folder.exists():
             print(f"{folder} exists already and is left as it is")
             continue
