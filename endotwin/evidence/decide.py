@@ -35,7 +35,7 @@ from endotwin.evidence.log_light import Bounced
 from endotwin.evidence.probe import Fitted, Hypothesis, Probe
 from endotwin.evidence.tint import Tints
 from endotwin.evidence.verdict import MIN_GAIN_DB, MIN_IMPOSSIBLE_DB, MIN_SIGMAS, Verdict
-from endotwin.evidence.worth import BARE, LEAST, more_usual, worth
+from endotwin.evidence.worth import BARE, DOUBT, LEAST, more_usual, worth
 from endotwin.light.guides import AT_LENS, COSINE, EXPONENTIAL
 from endotwin.pixels.casts import Casts
 from endotwin.pixels.samples import Samples
@@ -240,19 +240,18 @@ class _Trial:
         return sorted(BESIDE, key=gain_db, reverse=True) if tried == list(BESIDE) else list(BESIDE)
 
     def beside(self, name: str, kept: Fitted) -> Fitted:
-        """``kept`` with profile or vignetting beside it, if it is worth that, and its guides moved to where
-        they then predict best."""
+        """``kept`` with profile or vignetting beside it, if that is worth it where the guides of each predict
+        best: guides that were found without it may have made up for it."""
         if not self._tried(name, kept):
             self._say(name, False, None)
             return kept
         began = time.perf_counter()
-        other = self._with(name, kept)
+        other, forced = self._with(name, kept), self.wanted(name) == "on"
         verdict = self._verdict_beside(name, kept, other)
-        on = self.wanted(name) == "on" or worth(name, verdict, other)
-        if on and other.hypothesis.guides_mm != AT_LENS:
+        if (forced or verdict.worth(DOUBT)) and other.hypothesis.guides_mm != AT_LENS:
             kept, other = settled(self._ground, kept), settled(self._ground, other)
             verdict = self._verdict_beside(name, kept, other)
-            on = self.wanted(name) == "on" or worth(name, verdict, other)
+        on = forced or worth(name, verdict, other)
         self._say(name, on, verdict)
         self._seconds[name] += time.perf_counter() - began
         return other if on else kept

@@ -27,7 +27,8 @@ ANOTHER = Verdict(BARE_HINT.gain_db, BARE.sigmas)
 once more. Of seventeen random scenes none gained more than 3.2 sigmas by one too many."""
 
 DOUBT = Verdict(0.0, 1.0)
-"""What guides have to gain, and their shadows alone, for a closer look at where they are."""
+"""What guides have to gain, and their shadows alone, or an effect beside guides, for a closer look at where
+these are."""
 
 UNSHADED = Verdict(0.5, MIN_SIGMAS)
 """What guides beside bounced light have to gain where their shadows do not show: on two random scenes with
