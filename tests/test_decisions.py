@@ -82,15 +82,14 @@ def test_a_response_that_no_display_has_is_found_where_light_bounces(find) -> No
 
 @pytest.mark.long
 def test_a_haze_brighter_than_water_does_not_ruin_a_bounce(find, monkeypatch) -> None:
-    """Whatever the highlights say: it passes for the tissue's own lobe, and sends on what falls on it.
-    Without it there are 38.3 dB; with it 37.3 to 38.6, by where n starts and how threads share the sums."""
+    """Whatever the highlights say: it passes for the tissue's own lobe, and sends on what falls on it."""
     said = Decision("on", "the highlights say so", 1.1)
     haze = Coat(weight=7.0, roughness=0.32, tail=1.0)
     monkeypatch.setattr(light_stage, "judged_coat", lambda highlights, wanted, tried: (haze, said))
     twin, made = find(224, {"interreflection"})
     assert "interreflection" in twin.effects and said.reason in twin.decisions["coat"].reason
     assert twin.response.gamma == pytest.approx(made["gamma"], rel=0.06)
-    assert endotwin.evaluate(twin).psnr_covered > 36.5
+    assert endotwin.evaluate(twin).psnr_covered > 37.5
 
 
 @pytest.mark.long

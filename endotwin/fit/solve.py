@@ -41,7 +41,7 @@ from endotwin.light.guides import AT_LENS
 from endotwin.pixels.length_unit import unit_mm
 from endotwin.pixels.pace import ITERATIONS, Pace
 from endotwin.pixels.samples import Samples, Views, drawn, gather, whole_groups
-from endotwin.pixels.start import ALBEDO_TOP, BRIGHT, Start, closed_form, start_at
+from endotwin.pixels.start import ALBEDO_TOP, BRIGHT, PRIOR, Start, closed_form, start_at
 from endotwin.run.threads import THREADS, one_core
 from endotwin.surface import Surface
 from endotwin.surface.casting import Caster
@@ -262,7 +262,7 @@ class _Fit:
                 shown = casts.taken_off(shown)
                 samples = casts.taken_off(samples, toned and toned[0])
             if decided.start is not None or toned is not None:
-                start = _start_beside(decided, shown[pixels.start], surface)
+                start = self._start_beside(decided, shown[pixels.start])
             faint = NOTHING
             if not start.undetermined:
                 faint = Faint.beside(decided.effects, self.states, shown[pixels.light], surface)
@@ -277,6 +277,17 @@ class _Fit:
             stage = LightStage(*parts, surface, start, self.pace, relighting, wanted, self.device, found)
             self.pace.leave(stage.cost.detail_s(self._weights, len(samples), self.pace.plan.steps))
             return _Lighted(decided, samples, start, relighting, stage.cost, stage.found())
+
+    def _start_beside(self, decided: Decided, shown: Samples) -> Start:
+        """Where the fit starts beside the effects that are ``decided``, from what is ``shown``. Where light
+        bounces n is yet to be scouted, if there is time."""
+        mesh = self.twin.surface.triangles, len(self.twin.surface.vertices_mm)
+        if decided.start is None:
+            return closed_form(shown, *mesh)
+        n, q, gamma = decided.start
+        if "interreflection" in decided.effects and not self.pace.hurried:
+            n = PRIOR["n"]
+        return start_at(shown, *mesh, n, q, gamma)
 
     def _decided(self, pixels: _Pixels, shown: Samples, start: Start, near_mm: Guides) -> Decided:
         """The effects that photos which look as ``shown`` tell; guides are sought first ``near_mm``."""
@@ -372,14 +383,6 @@ class _Fit:
                 glare = bloom(wet, samples, glares, pace.report)
         found = [each for each in (wet.effect, glitter[0], glare[0]) if each is not None]
         return wet, found, {"film": wet.decision, "sparkle": glitter[1], "bloom": glare[1]}
-
-
-def _start_beside(decided: Decided, shown: Samples, surface: Surface) -> Start:
-    """Where the fit starts beside the effects that are ``decided``, from what is ``shown``."""
-    mesh = surface.triangles, len(surface.vertices_mm)
-    if decided.start is None:
-        return closed_form(shown, *mesh)
-    return start_at(shown, *mesh, *decided.start)
 
 
 def _without_bounce(decision: Decision) -> Decision:
