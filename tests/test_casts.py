@@ -8,7 +8,7 @@ import tube_sequence
 
 import endotwin
 from endotwin.effects.tone import Tone
-from endotwin.pixels.casts import Casts
+from endotwin.pixels.casts import LEAST_CAST, Casts, standing_out
 from endotwin.pixels.samples import Samples
 
 CASTS = Casts(np.array([2, 5]), np.array([[-0.08, 0.0, 0.01], [0.05, 0.0, -0.06]]))
@@ -43,6 +43,16 @@ def test_what_is_clipped_stays_so_and_nothing_else_passes_white():
     color = np.array([[255, 255, 255], [250, 250, 250], [0, 0, 0]], np.uint8)
     mended = CASTS.taken_off(samples_of(color, np.full(3, 2))).color.numpy()
     assert mended[0].tolist() == [255] * 3 and mended[1].tolist() == [255, 250, 248] and not mended[2].any()
+
+
+@pytest.mark.parametrize("odd", [[], [7], [13, 21], [9, 10, 11, 12]])
+def test_photos_whose_hue_jumps_stand_out_and_those_into_which_it_drifts_do_not(odd):
+    count = 22
+    drift = np.stack([np.linspace(0.5, -0.5, count) ** 3, 0.01 * np.sin(np.arange(count))], axis=1)
+    log = 0.4 * drift + np.isin(np.arange(count), odd)[:, None] * [-0.12, 0.03]
+    assert np.abs(np.diff(0.4 * drift, axis=0)).max() < LEAST_CAST < np.abs(0.4 * drift).max()
+    assert np.flatnonzero(standing_out(log, np.abs(log))).tolist() == odd
+    assert not standing_out(log, 0 * log).any()
 
 
 def test_a_photo_of_another_white_balance_bends_no_fit(tmp_path, caplog):

@@ -22,17 +22,12 @@ from endotwin.evidence.coat import LEAST_SIGHTINGS
 from endotwin.evidence.probe import Fitted, Probe
 from endotwin.evidence.tone import RATIO_ERROR, RATIOS
 from endotwin.evidence.verdict import Halved, Verdict, compared, predicts_better
-from endotwin.pixels.casts import WIDTHS, Casts
+from endotwin.pixels.casts import Casts, standing_out
 from endotwin.pixels.fixed_effects import Design, regress
-from endotwin.robust import robust_std
 
 FAINT = 0.1
 """Of ``log_colors``: γ times a fifth of the bounce that is expected; of random scenes with one none has less
 than twice as much."""
-
-LEAST_CAST = 0.02
-"""Where photos hardly vary otherwise, what a bounce errs by turns single ones by up to 0.016; and less costs
-next to nothing."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,17 +64,15 @@ class Tints:
         """Photos whose white balance is another than that of the rest, beside a tone curve and a bounce of
         any strength; None if there are none.
 
-        What the bounce errs by turns the hues of photos, too, more and more along the camera's path. So a
-        photo has a cast if it stands out among all, by what either half of the places says, and enough of its
-        places are in others.
+        A photo has a cast if it stands out among all, by what either half of the places says, and enough of
+        its places are in others.
         """
         every = np.ones_like(self._half)
         if len(self.probe.frames) < 2:
             return None
         log, *by_half = (self._log_casts(part) for part in (every, self._half, ~self._half))
         told = np.min([np.sign(log) * each for each in by_half], axis=0)
-        odd = (told > max(LEAST_CAST, WIDTHS * robust_std(log))).any(axis=1)
-        odd &= self._beside_others >= LEAST_SIGHTINGS
+        odd = standing_out(log, told) & (self._beside_others >= LEAST_SIGHTINGS)
         if not odd.any():
             return None
         red, blue = log[odd].T

@@ -10,9 +10,14 @@ import torch
 
 from endotwin.effects.tone import Tone
 from endotwin.pixels.samples import CLIPPED, Samples
+from endotwin.robust import robust_std
 
 WIDTHS = 5.0
 """What is off by so many times what the others are stands out."""
+
+LEAST_CAST = 0.02
+"""Where photos hardly vary otherwise, what a bounce errs by turns single ones by up to 0.016; and less costs
+next to nothing."""
 
 COLORS = ("red", "green", "blue")
 
@@ -56,6 +61,22 @@ class Casts:
     def to_dict(self) -> dict[str, Sequence[float]]:
         """``log`` by the photo's number."""
         return {str(frame): row for frame, row in zip(self.frames, self.log.round(4).tolist(), strict=True)}
+
+
+def standing_out(log: np.ndarray, sure: np.ndarray) -> np.ndarray:
+    """Which photos stand out among all, bool [F].
+
+    What a bounce errs by turns the hues of photos, too, more and more along the camera's path. So none does
+    that others, which do not, pass into by steps of less than a cast.
+
+    Args:
+        log: ln of red and blue, beside green and the median photo, in the order of the path, [F, 2].
+        sure: how much of that is sure, [F, 2].
+    """
+    stands_out = (sure > max(LEAST_CAST, WIDTHS * robust_std(log))).any(axis=1)
+    jumps = np.abs(np.diff(log, axis=0)).max(axis=1) > LEAST_CAST
+    run = np.append(0, np.cumsum(jumps))
+    return np.bincount(run, ~stands_out)[run] == 0
 
 
 def told(log: float, channel: int) -> str:
