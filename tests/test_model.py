@@ -407,9 +407,10 @@ def test_the_joint_step_with_exact_solutions_is_the_solution_of_the_bordered_sys
     right = np.concatenate([residual[:, None], border], axis=1)
     basis = np.linalg.solve(inner, right)
     shaped = [torch.from_numpy(x.reshape(10, 4, 6)) for x in (basis, inner @ basis, right)]
-    weights, shared_step = joint_minimum(*shaped, shared, shared_residual)
+    weights, shared_step, covariance = joint_minimum(*shaped, shared, shared_residual)
     exact = np.linalg.solve(whole, np.r_[residual, shared_residual])
     np.testing.assert_allclose(shared_step, exact[40:], rtol=1e-6)
+    np.testing.assert_allclose(covariance, np.linalg.inv(whole)[40:, 40:], rtol=1e-6)
     np.testing.assert_allclose(basis @ weights, exact[:40], rtol=1e-5, atol=1e-7)
 
 

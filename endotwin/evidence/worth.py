@@ -50,8 +50,7 @@ def worth(name: str, verdict: Verdict, model: Fitted) -> bool:
     without it."""
     bounces = model.hypothesis.bounced is not None
     if name == "vignetting":
-        plain = verdict.worth(Verdict(0.0, LEAST.sigmas)) and explained(verdict, model) >= ROUNDING
-        return plain or verdict.worth(LEAST)
+        return vignettes(verdict, model.effects.width) or verdict.worth(LEAST)
     if name == "interreflection":
         return verdict.worth(LEAST) or more_usual(verdict)
     if name == "offset" and bounces:
@@ -64,10 +63,11 @@ def worth_another(verdict: Verdict, model: Fitted) -> bool:
     return verdict.keep or (model.hypothesis.bounced is None and verdict.worth(ANOTHER))
 
 
-def explained(verdict: Verdict, model: Fitted) -> float:
-    """Root mean square of what ``model`` explains beside another, by the ``verdict`` on it, in ln of display
-    values."""
-    return model.effects.width * math.sqrt(max(0.0, 10 ** (verdict.gain_db / 10) - 1))
+def vignettes(verdict: Verdict, width: float) -> bool:
+    """Whether vignetting explains, by the ``verdict`` on it, more than ROUNDING of what is left, whose
+    ``width`` is in ln of display values."""
+    explained = width * math.sqrt(max(0.0, 10 ** (verdict.gain_db / 10) - 1))
+    return verdict.worth(Verdict(0.0, LEAST.sigmas)) and explained >= ROUNDING
 
 
 def more_usual(verdict: Verdict) -> bool:

@@ -93,6 +93,8 @@ class GaussNewton:
         held: which shared parameters stay in joint steps.
         errs_by: the model, where light bounces, in a way that passes for another γ: display values, root mean
             square, alike in many pixels.
+        spread: standard deviations of the shared parameters beside all else, float64 [G], as the last joint
+            step knew them.
         solve_s: seconds of the last step, of what does not take longer with more samples.
     """
 
@@ -117,6 +119,7 @@ class GaussNewton:
         self._unit_mm = unit_mm
         self.held: tuple[str, ...] = ()
         self.errs_by = FIRST_ERROR
+        self.spread = _NO_GAINS
         self.solve_s = 0.0
         self._border: Tensor | None = None
         self.out_of_time = out_of_time
@@ -349,7 +352,8 @@ class GaussNewton:
         pull = (precision * (mean - state.shared.vector)).numpy()
         shared_normal = columns.T @ equations.shared @ columns * scale + free.T @ np.diag(precision) @ free
         shared_right = columns.T @ equations.shared_right * scale + free.T @ pull
-        weights, along = joint_minimum(solved, image, right, shared_normal, shared_right)
+        weights, along, covariance = joint_minimum(solved, image, right, shared_normal, shared_right)
+        self.spread = np.sqrt(np.einsum("gk,kl,gl->g", free, covariance, free).clip(0))
         return solved @ self._placed_matrix(weights), torch.from_numpy(free @ along)
 
     def _following(

@@ -19,6 +19,7 @@ from endotwin.evidence.coat import Highlights, best_coat
 from endotwin.evidence.coat import judged as judged_coat
 from endotwin.evidence.tone import LEAST_CONTRAST, Hues, steadied
 from endotwin.evidence.tone import judged as judged_tone
+from endotwin.fit import lens
 from endotwin.fit.lighting import Relighting
 from endotwin.fit.model import Globals, at_pixels
 from endotwin.fit.scout import likeliest_n
@@ -44,6 +45,9 @@ another n and half of the bounce."""
 COAT_STEP, NEAR, LATEST = 2, 0.1, 8
 """A coat that nobody asked for, and a tone curve, are judged when light and materials are near: after so many
 steps; or, where light bounces, after one by which the cost fell by a smaller share, or at the latest."""
+
+JUDGED = ("coat", "tone")
+"""Effects that nothing else has judged."""
 
 BOUNCE_HELD = ("q", "L0")
 """Where light bounces, q stays where the fit starts, at the inverse square of a small light: what the bounce
@@ -122,9 +126,9 @@ class LightStage:
     Args:
         samples: that tell the light, under it. clipped: those that only say 'at least', not lit, to which a
             coat is held, too.
-        wanted: auto, on or off, of coat and tone. before: what was found before without the tone curve that
-            this found. Where light bounces the search goes on from there, and where time is short the coat is
-            judged at once.
+        wanted: auto, on or off, of coat, tone and vignetting. before: what was found before without the tone
+            curve that this found. Where light bounces the search goes on from there, and where time is short
+            the coat is judged at once.
 
     Attributes:
         cost: what its first step took.
@@ -146,7 +150,7 @@ class LightStage:
         self._relighting, self._undetermined = relighting, start.undetermined
         self._bare: Best | None = None
         tone, decision = (None, None) if before is None else before.toned
-        self._decisions = {name: unjudged(state) for name, state in wanted.items() if state == "off"}
+        self._decisions = {name: unjudged(wanted[name]) for name in JUDGED if wanted[name] == "off"}
         if tone is not None:
             self._decisions["tone"] = decision
         self._unit_mm = unit_mm(surface)
@@ -174,9 +178,11 @@ class LightStage:
     def found(self) -> FoundLight:
         """What is found; where that is a tone curve, as soon as it is."""
         toned = self._in_one_step() if self._relighting.bounces else None
+        if toned is None and self._newly_vignetted():
+            toned = self._in_one_step()
         if not self._relighting.bounces:
             toned = self._in_turns()
-        decisions = {name: unjudged(state) for name, state in self._wanted.items()} | self._decisions
+        decisions = {name: unjudged(self._wanted[name]) for name in JUDGED} | self._decisions
         return FoundLight(self._state, decisions, toned)
 
     def _in_turns(self) -> Toned | None:
@@ -342,7 +348,24 @@ class LightStage:
         self._pace.report("find the light", number + 1, steps)
         if not done:
             return number + 1
-        return steps if len(self._decisions) == len(self._wanted) else max(number + 1, coat_step)
+        return steps if self._decisions.keys() >= set(JUDGED) else max(number + 1, coat_step)
+
+    def _newly_vignetted(self) -> bool:
+        """Where light bounces, put a lens that vignettes before what is found, if pixels say so and nobody
+        has said otherwise; whether it was. Guides, which may have made up for it, move again."""
+        relighting, held = self._relighting, (*self._undetermined, *BOUNCE_HELD)
+        judged = self._wanted["vignetting"] != "auto" or "vignetting" in relighting.effects
+        if judged or "n" in held or self._late or not relighting.bounces:
+            return False
+        self._solver.held = held
+        before = self._better(None)
+        self._state, decision = lens.tried(self._solver, relighting, self._state)
+        if decision is None:
+            self._take_best(before)
+            return False
+        self._decisions["vignetting"] = decision
+        self._goes_on, self._moves = True, MOVES if relighting.effects.guides_mm else 0
+        return True
 
     def _newly_toned(self) -> Toned | None:
         """A tone curve and why, if it is not judged yet, and there is one."""

@@ -57,7 +57,7 @@ def conjugate_gradients(
 
 def joint_minimum(
     basis: Tensor, image: Tensor, right: Tensor, shared_normal: np.ndarray, shared_right: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Minimise the bordered quadratic over the shared parameters and the span of ``basis``.
 
     With exact solutions as basis this is elimination by Schur complement; with truncated ones it still
@@ -68,14 +68,16 @@ def joint_minimum(
             which the first is the residual's and the others border the matrix.
 
     Returns:
-        weights of the basis [1 + G]; shared step [G].
+        weights of the basis [1 + G]; shared step [G]; its covariance [G, G], the inverse of the Schur
+        complement.
     """
     columns = basis.shape[2]
     flat = [x.reshape(-1, columns).double().cpu().numpy() for x in (basis, image, right)]
     inner, border = flat[0].T @ flat[1], flat[0].T @ flat[2]
     matrix = np.block([[inner, border[:, 1:]], [border[:, 1:].T, shared_normal]])
     solution = np.linalg.lstsq(matrix, np.r_[border[:, 0], shared_right], rcond=1e-12)[0]
-    return solution[:columns], solution[columns:]
+    covariance = np.linalg.pinv(matrix, rcond=1e-12)[columns:, columns:]
+    return solution[:columns], solution[columns:], covariance
 
 
 def squared(matrix: Tensor) -> Tensor:

@@ -29,6 +29,8 @@ EVERY_GLOBAL = (*GLOBALS, "gamma·k2", "contrast", "ln albedo scale")
 """Behind a lens that vignettes there is one more, since light of another n passes for most of that; under a
 tone curve another; and with interreflection one that tells how bright the tissue is beside the light."""
 
+K2 = EVERY_GLOBAL.index("gamma·k2")
+
 
 @dataclass(frozen=True)
 class Globals:

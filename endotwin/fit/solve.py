@@ -269,7 +269,7 @@ class _Fit:
             relighting = Relighting(surface, self.caster, decided.effects, samples.views, faint)
             telling = relighting.lit(samples[pixels.light])
         with self.pace.stopwatch.stage("light"):
-            wanted = {name: self.states.get(name, "auto") for name in ("coat", "tone")}
+            wanted = {name: self.states.get(name, "auto") for name in ("coat", "tone", "vignetting")}
             if "specular" not in decided.effects:
                 wanted["coat"] = "off"
             parts = telling, samples[pixels.white]
