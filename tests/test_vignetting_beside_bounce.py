@@ -11,10 +11,10 @@ from endotwin.effects.interreflection import Interreflection
 from endotwin.effects.specular import Specular
 from endotwin.effects.vignetting import Vignetting
 from endotwin.fit.gauss_newton import GaussNewton
-from endotwin.fit.lens import tried
 from endotwin.fit.lighting import Relighting, lit
 from endotwin.fit.model import Globals
 from endotwin.fit.steps import stepped
+from endotwin.fit.vignetting import tried
 from endotwin.surface.casting import Caster
 
 HELD = ("q", "L0")

@@ -34,7 +34,7 @@ IHB = 32.0
 MOTTLED = 0.06
 """Standard deviation by which a polyp's base colour swings with its bumps."""
 
-STEP = 1e-3
+DIFFERENCE = 1e-3
 """Of finite differences, as a share of the distance from the axis."""
 
 
@@ -151,7 +151,9 @@ class _Patch:
         """Where points [N, 3] with ``normals`` [N, 3] go, and their normals there."""
         if self.shape.flat:
             return rest, normals
-        step = STEP * (np.linalg.norm(rest[:, :2], axis=1) + self.shape.radius_mm / self.shape.magnified)
+        step = DIFFERENCE * (
+            np.linalg.norm(rest[:, :2], axis=1) + self.shape.radius_mm / self.shape.magnified
+        )
         sides = []
         for axis in np.eye(2):
             ahead, behind = (

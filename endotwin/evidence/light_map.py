@@ -26,7 +26,7 @@ less of the light."""
 LEAST = 0.01
 """Of the light that all places would throw on a pixel together: what shows light is lit by so much."""
 
-STEP = 1.0
+SHARE_SPREAD = 1.0
 """Standard deviation by which a round changes a share."""
 
 
@@ -127,7 +127,7 @@ class _Light:
         level = np.log(total) - n * by_n - q * by_q - each @ share
         columns, gamma = [each, np.stack([by_n, by_q, level, by_retro], axis=1)], PRIOR["gamma"]
         mean = [*(gamma * share), *LIGHT_MEAN, 0.0]
-        spread = [*np.full(len(share), gamma * STEP), *LIGHT_SPREAD, gamma * TISSUE_SPREAD[0]]
+        spread = [*np.full(len(share), gamma * SHARE_SPREAD), *LIGHT_SPREAD, gamma * TISSUE_SPREAD[0]]
         if hypothesis.vignetting:
             columns.append(probe.vignetting_column[:, None])
             mean, spread = [*mean, 0.0], [*spread, VIGNETTING_SPREAD]

@@ -19,7 +19,7 @@ from endotwin.evidence.coat import Highlights, best_coat
 from endotwin.evidence.coat import judged as judged_coat
 from endotwin.evidence.tone import LEAST_CONTRAST, Hues, steadied
 from endotwin.evidence.tone import judged as judged_tone
-from endotwin.fit import lens
+from endotwin.fit import vignetting
 from endotwin.fit.lighting import Relighting
 from endotwin.fit.model import Globals, at_pixels
 from endotwin.fit.scout import likeliest_n
@@ -359,7 +359,7 @@ class LightStage:
             return False
         self._solver.held = held
         before = self._better(None)
-        self._state, decision = lens.tried(self._solver, relighting, self._state)
+        self._state, decision = vignetting.tried(self._solver, relighting, self._state)
         if decision is None:
             self._take_best(before)
             return False

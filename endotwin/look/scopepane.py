@@ -21,7 +21,7 @@ HELP = [
     "drag, Left, Right, PgUp, PgDn: turn   wheel, Up, Down: ahead, back   click: what is known of a point",
     "comma, period: previous, next photo   slash: next held out   k: keep pose   x: save picture   y: prices",
 ]
-STEP = 0.04
+MOVE = 0.04
 """Of the usual distance: how far a key moves."""
 
 TURN, TURN_PX = 0.06, 0.004
@@ -140,7 +140,7 @@ class ScopePane:
         return 12.0, 0.42 * self._plotter.window_size[1] + 1.5 * SWITCH_PX * row
 
     def _key_actions(self) -> dict[str, Callable[[], None]]:
-        scope, step = self._scope, STEP * self._scope.usual_mm
+        scope, step = self._scope, MOVE * self._scope.usual_mm
         flights = {
             "Up": lambda: scope.move(ahead_mm=step),
             "Down": lambda: scope.move(ahead_mm=-step),
@@ -241,7 +241,7 @@ class ScopePane:
     def _wheel(self, steps: int) -> bool:
         if not self._within():
             return False
-        self._scope.move(ahead_mm=steps * STEP * self._scope.usual_mm)
+        self._scope.move(ahead_mm=steps * MOVE * self._scope.usual_mm)
         self._moved()
         return True
 

@@ -38,6 +38,6 @@ def tried(solver: GaussNewton, relighting: Relighting, state: State) -> tuple[St
     verdict = Verdict(10 * math.log10(1 + sigmas**2 / 2 / cost), sigmas)
     if not vignettes(verdict, noise / shown):
         return found, None
-    reason = f"light of another exponent explains all pixels worse ({verdict})"
+    reason = f"light of another exponent explains all pixels less well ({verdict})"
     took_s = round(time.perf_counter() - began, 3)
     return found, Decision("on", reason, round(verdict.gain_db, 3), took_s)
