@@ -119,7 +119,7 @@ class GaussNewton:
         self._unit_mm = unit_mm
         self.held: tuple[str, ...] = ()
         self.errs_by = FIRST_ERROR
-        self.spread = _NO_GAINS
+        self.spread = np.zeros(0)
         self.solve_s = 0.0
         self._border: Tensor | None = None
         self.out_of_time = out_of_time

@@ -47,7 +47,7 @@ COAT_STEP, NEAR, LATEST = 2, 0.1, 8
 steps; or, where light bounces, after one by which the cost fell by a smaller share, or at the latest."""
 
 JUDGED = ("coat", "tone")
-"""Effects that nothing else has judged."""
+"""Effects that this stage alone judges."""
 
 BOUNCE_HELD = ("q", "L0")
 """Where light bounces, q stays where the fit starts, at the inverse square of a small light: what the bounce
@@ -353,11 +353,11 @@ class LightStage:
     def _newly_vignetted(self) -> bool:
         """Where light bounces, put a lens that vignettes before what is found, if pixels say so and nobody
         has said otherwise; whether it was. Guides, which may have made up for it, move again."""
-        relighting, held = self._relighting, (*self._undetermined, *BOUNCE_HELD)
+        relighting = self._relighting
         judged = self._wanted["vignetting"] != "auto" or "vignetting" in relighting.effects
-        if judged or "n" in held or self._late or not relighting.bounces:
+        if judged or "n" in self._undetermined or self._late or not relighting.bounces:
             return False
-        self._solver.held = held
+        self._solver.held = (*self._undetermined, *BOUNCE_HELD)
         before = self._better(None)
         self._state, decision = vignetting.tried(self._solver, relighting, self._state)
         if decision is None:
