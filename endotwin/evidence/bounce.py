@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import lru_cache, partial
+from functools import lru_cache
 
 import numpy as np
 import torch
@@ -14,7 +14,6 @@ from endotwin.light.bounced import Albedo, BouncedLight, Places
 from endotwin.light.forward import Lobes
 from endotwin.light.radiosity import Radiosity
 from endotwin.light.shading import F0_DIELECTRIC, ROUGHNESS_TISSUE
-from endotwin.pixels.samples import Samples
 from endotwin.pixels.start import PRIOR
 from endotwin.run.ahead import on_all_cores
 
@@ -30,24 +29,38 @@ PROBE_ALBEDOS = (0.55, 0.7, 0.85)
 FIXED_POINT_ROUNDS = 2
 
 
-def cell_mm(samples: Samples) -> float:
-    """Size of the patches for a scene that is seen as ``samples`` are."""
-    return CELL * samples.distance_mm
+class Patches:
+    """The tissue of the scene of a probe, in patches that throw light on each other.
+
+    Attributes:
+        cell_mm: their size. light: what they throw on each other in the light of some frames, as of
+            ``_light``; what was asked for last is kept.
+    """
+
+    def __init__(self, probe: Probe):
+        self.cell_mm = CELL * probe.samples.distance_mm
+        self.radiosity = Radiosity(probe.twin.surface, probe.caster, self.cell_mm, PROBE_RAYS)
+        self._views, self.light = probe.samples.views, lru_cache(1)(self._light)
+
+    def _light(
+        self, frames: tuple[int, ...], guides_mm: tuple[tuple[float, float, float], ...], profile: float
+    ) -> BouncedLight:
+        poses = self._views.T_local_camera[np.searchsorted(self._views.frames, frames)]
+        return BouncedLight(self.radiosity, poses, guides_mm, profile)
 
 
 class Surroundings:
-    """The tissue that throws light on a probe's pixels, in patches."""
+    """The tissue that throws light on a probe's pixels."""
 
-    def __init__(self, probe: Probe):
-        self._probe, samples, roughness = probe, probe.samples, torch.tensor(ROUGHNESS_TISSUE)
-        radiosity = Radiosity(probe.twin.surface, probe.caster, cell_mm(samples), PROBE_RAYS)
+    def __init__(self, probe: Probe, patches: Patches):
+        self._probe, self._patches, roughness = probe, patches, torch.tensor(ROUGHNESS_TISSUE)
+        samples, radiosity = probe.samples, patches.radiosity
         self._radiosity, self._patch = radiosity, radiosity.patch_of[samples.triangle.numpy()]
         self._places = Places(radiosity.to_points(probe.local_points_mm, probe.local_normals), probe.frame)
         self._linear = (np.maximum(samples.color.numpy(), 1) / 255.0) ** (1 / PRIOR["gamma"])
         lobes = Lobes(F0_DIELECTRIC)
         self._glossy = np.full((radiosity.count, 1), lobes.glossy_albedo(roughness))
         self._gloss = lobes.gloss(samples.cos, roughness)[:, 0].numpy()
-        self._light = lru_cache(1)(partial(BouncedLight, radiosity, probe.T_local_camera))
 
     def bounced(self, hypothesis: Hypothesis) -> Bounced:
         """Indirect light at the pixels, with n, q and γ at their priors.
@@ -75,7 +88,8 @@ class Surroundings:
     def _lights(self, hypothesis: Hypothesis) -> tuple[BouncedLight, np.ndarray]:
         """What throws light, and the irradiance [N] that comes from there itself."""
         direct = self._probe.direct_light(hypothesis, PRIOR["n"], PRIOR["q"])
-        return self._light(hypothesis.guides_mm, hypothesis.profile), direct
+        frames = tuple(self._probe.frames.tolist())
+        return self._patches.light(frames, hypothesis.guides_mm, hypothesis.profile), direct
 
     def _albedo(self, light: BouncedLight, direct: np.ndarray, brightest: float) -> Albedo:
         """That of patches, the brightest of them ``brightest``, if ``direct`` [N] comes from the ``light``

@@ -14,7 +14,7 @@ import math
 import time
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
-from functools import cache, cached_property
+from functools import cache, cached_property, partial
 from itertools import combinations
 
 import numpy as np
@@ -28,7 +28,7 @@ from endotwin.effects.profile import Profile
 from endotwin.effects.shadows import Shadows
 from endotwin.effects.specular import Specular
 from endotwin.effects.vignetting import Vignetting
-from endotwin.evidence.bounce import Surroundings, cell_mm
+from endotwin.evidence.bounce import Patches, Surroundings
 from endotwin.evidence.glints import Glints
 from endotwin.evidence.guide_search import Ground, Guides, Search, found_guides, polished, settled
 from endotwin.evidence.log_light import Bounced
@@ -90,13 +90,15 @@ def decide(
         near_mm: guides near which others are looked for first; the lens: none.
     """
 
-    def trial_of(samples: Samples) -> _Trial:
-        return _Trial(Probe(samples, twin, caster), glints, wanted, late, near_mm)
+    def trial_of(probe: Probe) -> _Trial:
+        return _Trial(probe, patches, glints, wanted, late, near_mm)
 
-    trial = trial_of(samples)
+    probe = Probe(samples, twin, caster)
+    patches = cache(partial(Patches, probe))
+    trial = trial_of(probe)
     casts = trial.casts()
     if casts is not None:
-        trial = trial_of(casts.taken_off(samples))
+        trial = trial_of(Probe(casts.taken_off(samples), twin, caster))
     kept = trial.together()
     kept = trial.shadowed(kept)
     for name in trial.stronger_first(kept):
@@ -110,13 +112,14 @@ class _Trial:
     def __init__(
         self,
         probe: Probe,
+        patches: Callable[[], Patches],
         glints: Callable[[], Glints],
         wanted: Mapping[str, str],
         late: Callable[[], bool],
         near_mm: Guides,
     ):
-        self._probe, self._glints, self._wanted, self._late = probe, glints, wanted, late
-        self._near_mm = near_mm
+        self._probe, self._patches, self._glints = probe, patches, glints
+        self._wanted, self._late, self._near_mm = wanted, late, near_mm
         self._decisions: dict[str, Decision] = {}
         self._seconds = dict.fromkeys((*TOGETHER, *BESIDE), 0.0)
         self._model, self._bouncing = cache(self._fitted), cache(self._bounced)
@@ -341,7 +344,7 @@ class _Trial:
 
     @cached_property
     def _surroundings(self) -> Surroundings:
-        return Surroundings(self._probe)
+        return Surroundings(self._probe, self._patches())
 
     def _best(self, sets: list[frozenset[str]]) -> frozenset[str]:
         """The set that predicts held-out pixels best, with bounced light where they do not tell, but light
@@ -469,7 +472,7 @@ class _Trial:
         if hypothesis.shadows:
             effects.append(Shadows())
         if hypothesis.bounced is not None:
-            effects.append(Interreflection(cell_mm(probe.samples)))
+            effects.append(Interreflection(self._patches().cell_mm))
         if self._decisions["profile"].state == "on":
             effects.append(Profile(hypothesis.profile))
         if hypothesis.gain:

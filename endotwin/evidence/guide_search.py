@@ -30,9 +30,6 @@ SEARCH_PIXELS = 8_000
 STEPS, TOLERANCE = 12, 1e-3
 """The search ends when positions move by less than this share of the radius, or the loss by less."""
 
-SEEN_GUIDES = 64
-"""What so many guides see is kept: of several one is moved at a time."""
-
 DEEPEST = 1.0
 """Of the radius: guides lie at most so far behind the lens."""
 
@@ -53,7 +50,6 @@ class Ground:
         self.probe, self.glints, self._rows = probe, glints, rows
         self.radius_mm = RADIUS * probe.samples.distance_mm
         self.places_mm = places_mm(self.radius_mm)
-        self._seen = lru_cache(SEEN_GUIDES)(lambda guide: probe.visible(np.float32(guide), self._at_risk))
         self.unshadowed = lru_cache(1)(self._unshadowed)
 
     @cached_property
@@ -65,7 +61,7 @@ class Ground:
     @cached_property
     def lit(self) -> np.ndarray:
         """Bool [N, K]: which of the places see each pixel's point."""
-        return self.probe.visible_to(self.places_mm)
+        return self.probe.visible(self.places_mm)
 
     @cached_property
     def _at_risk(self) -> np.ndarray:
@@ -73,9 +69,8 @@ class Ground:
 
     def visible(self, guides_mm: np.ndarray) -> np.ndarray:
         """Bool [N, K]: which of guides [K, 3] see each pixel's point; those that all places see, all do."""
-        visible = np.ones((len(self.probe), len(guides_mm)), bool)
-        for k, guide in enumerate(guides_mm):
-            visible[self._at_risk, k] = self._seen(tuple(map(float, guide)))
+        visible = np.ones((len(guides_mm), len(self.probe)), bool).T
+        visible[self._at_risk] = self.probe.visible(guides_mm, self._at_risk)
         return visible
 
     def borne_out(self, model: Fitted, verdict: Verdict) -> bool:
@@ -237,8 +232,8 @@ class Search:
 
         def slopes(x: np.ndarray) -> np.ndarray:
             steps = ASIDE * np.eye(len(x))
-            aside = [self._guides(x + step, axes) for step in np.r_[steps, -steps]]
-            pixels = left(x.tobytes()).beside(np.stack([self._design(each).columns for each in aside]))
+            aside = np.stack([self._guides(x + step, axes) for step in np.r_[steps, -steps]])
+            pixels = left(x.tobytes()).beside(self._columns(aside))
             glints = np.stack([self._glints(each) for each in aside], axis=1)
             more, less = np.split(np.concatenate([pixels, glints]), 2, axis=1)
             return (more - less) / (2 * ASIDE)
@@ -268,6 +263,11 @@ class Search:
 
     def _design(self, guides_mm: np.ndarray) -> Design:
         return self._probe.linearised(self._with(guides_mm), self._base, self._ground.visible(guides_mm))
+
+    def _columns(self, sets_mm: np.ndarray) -> np.ndarray:
+        """Columns [M, N, C] of the designs of M sets of guides [M, K, 3]."""
+        hypothesis = self._with(sets_mm[0])
+        return self._probe.columns(hypothesis, self._base, sets_mm, self._ground.visible)
 
     def _glints(self, guides_mm: np.ndarray) -> np.ndarray:
         """Residuals of the glints, weighed as those of the probe's pixels are."""

@@ -8,6 +8,7 @@ from functools import cached_property
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from endotwin.light import shading
 from endotwin.light.forward import Lit
@@ -26,6 +27,9 @@ LIGHT_COLUMNS = 6
 
 ASIDE = 0.02
 """Roughness by which its derivative is taken."""
+
+LEAST_COS = 0.02
+"""By so much normals err: what turns no more to a guide answers as if it turned so much to it."""
 
 
 @dataclass(frozen=True)
@@ -88,28 +92,83 @@ class About:
 
 
 @dataclass(frozen=True)
+class Terms:
+    """What tissue at N pixels sends to the camera of the light of K guides, in logarithms, of M sets of them
+    or of one.
+
+    Attributes:
+        axis, distance: as in ``Guided``, [K, (M,) N]. answer: what tissue sends on, over Lambert's.
+        by_tissue: derivatives of that by retro, log_gloss and roughness, [3, K, (M,) N].
+    """
+
+    axis: np.ndarray
+    distance: np.ndarray
+    answer: np.ndarray
+    by_tissue: np.ndarray
+
+    def of(self, sets: np.ndarray) -> Terms:
+        """Those of ``sets`` [K, M] of the guides."""
+        return Terms(self.axis[sets], self.distance[sets], self.answer[sets], self.by_tissue[:, sets])
+
+    def columns(self, log_cos: np.ndarray, about: About, bounced: Bounced | None) -> np.ndarray:
+        """Columns [(M,) N, 6], linearised; their coefficients are γn, γq, γ, and γ times what retro,
+        log_gloss and roughness of the tissue are more than ``about`` has them. Where light is ``bounced``
+        there is a seventh: of γ times the change of the bounce's ln. ``log_cos`` as of ``log_cos``."""
+        n, q = about.n, about.q
+        terms = log_cos + n * self.axis - q * self.distance + self.answer
+        top = terms.max(axis=0)
+        if bounced is not None:
+            among = bounced.at(n, q)
+            top = np.maximum(top, among)
+        shares = np.exp(terms - top)
+        total = shares.sum(axis=0)
+        if bounced is not None:
+            by_bounce = np.exp(among - top)
+            total += by_bounce
+            by_bounce /= total
+        shares /= total
+        slopes = (self.axis, -self.distance, *self.by_tissue)
+        by_n, by_q, *by_tissue = (np.einsum("k...,k...->...", shares, slope) for slope in slopes)
+        if bounced is not None:
+            by_n += by_bounce * bounced.by_n
+            by_q += by_bounce * bounced.by_q
+        level = top + np.log(total) - n * by_n - q * by_q
+        columns = [by_n, by_q, level, *by_tissue, *([] if bounced is None else [by_bounce])]
+        return np.moveaxis(np.stack(columns), 0, -1)
+
+
+def log_cos(cos_i: np.ndarray) -> np.ndarray:
+    """ln of each guide's share n·ωi / K, of its n·ωi [K, (M,) N]; 0 in shadow."""
+    return np.log(np.maximum(cos_i / np.float32(len(cos_i)), np.float32(math.exp(DARKEST))))
+
+
+@dataclass(frozen=True)
 class LogLight:
     """ln Σ light·answer at N pixels, as a function of n, q and the tissue's answer.
 
     Attributes:
-        lit: by K guides. bounced: what comes from other tissue.
+        lit: by K guides, shadows or not. cos_i: n·ωi of those that the pixels see, float32 [K, N].
+        bounced: what comes from other tissue.
     """
 
     lit: Lit
+    cos_i: np.ndarray
     bounced: Bounced | None
 
     @cached_property
     def log_cos(self) -> np.ndarray:
         """ln of each guide's share n·ωi / K, [N, K]."""
-        cos_i = self.lit.guides.cos_i.numpy()
-        return np.log(np.maximum(cos_i / cos_i.shape[1], math.exp(DARKEST)))
+        return log_cos(self.cos_i).T
 
     @cached_property
     def log_burley(self) -> np.ndarray:
         """ln of the diffuse lobe where tissue is as rough as usual, over Lambert's, [N, K]."""
-        guides, roughness = self.lit.guides, torch.tensor(shading.ROUGHNESS_TISSUE)
-        lobe = shading.burley(guides.cos_i, self.lit.cos_o[:, None], guides.cos_d, roughness)
-        return lobe.log().numpy()
+        cos_d, roughness = self.lit.guides.cos_d, torch.tensor(shading.ROUGHNESS_TISSUE)
+        return shading.burley(self._cos_i, self.lit.cos_o[:, None], cos_d, roughness).log().numpy()
+
+    @cached_property
+    def _cos_i(self) -> Tensor:
+        return self.lit.guides.cos_i.clamp_min(LEAST_COS)
 
     def irradiance(self, n: float, q: float) -> np.ndarray:
         """[N], of all guides together with L0 = 1."""
@@ -119,40 +178,26 @@ class LogLight:
         )
 
     def columns(self, about: About, vertex: np.ndarray) -> np.ndarray:
-        """Columns [N, 6] at places of vertices [N], linearised; their coefficients are γn, γq, γ, and γ times
-        what retro, log_gloss and roughness of the tissue are more than ``about`` has them. Where light
-        bounces there is a seventh: of γ times the change of the bounce's ln."""
-        n, q, tissue = about.n, about.q, about.tissue
-        axis, distance = self.lit.guides.log_axis.numpy(), self.lit.guides.log_distance.numpy()
+        """``Terms.columns`` at places of vertices [N]."""
+        return self.terms(about, vertex).columns(self.log_cos.T, about, self.bounced)
+
+    def terms(self, about: About, vertex: np.ndarray) -> Terms:
+        """What tissue at places of vertices [N] makes of light that is in no shadow."""
+        guides, tissue, log_burley = self.lit.guides, about.tissue, self.log_burley.T
         lobe, by_roughness = self._lobe(tissue.roughness)
-        albedo = 1.0 if about.albedo is None else about.albedo[vertex, None]
-        shine = math.pi * math.exp(tissue.log_gloss) / albedo * lobe
-        answer = np.exp(tissue.retro * self.log_burley) + shine
-        shine = shine / answer
-        terms = self.log_cos + n * axis - q * distance + np.log(answer)
-        slopes = [axis, -distance, (1 - shine) * self.log_burley, shine, shine * by_roughness]
-        if self.bounced is not None:
-            terms = np.c_[terms, self.bounced.at(n, q)]
-        top = terms.max(axis=1, keepdims=True)
-        share = np.exp(terms - top)
-        total = np.einsum("nk->n", share)
-        share /= total[:, None]
-        guides = share[:, : axis.shape[1]]
-        by_n, by_q, *by_tissue = (np.einsum("nk,nk->n", guides, slope) for slope in slopes)
-        if self.bounced is not None:
-            by_n += share[:, -1] * self.bounced.by_n
-            by_q += share[:, -1] * self.bounced.by_q
-        by_bounce = [] if self.bounced is None else [share[:, -1]]
-        level = top[:, 0] + np.log(total)
-        return np.stack([by_n, by_q, level - n * by_n - q * by_q, *by_tissue, *by_bounce], axis=1)
+        gloss = np.float32(math.pi * math.exp(tissue.log_gloss))
+        shine = lobe * (gloss if about.albedo is None else gloss / about.albedo[vertex])
+        whole = np.exp(tissue.retro * log_burley) + shine
+        shine = shine / whole
+        by_tissue = np.stack([(1 - shine) * log_burley, shine, shine * by_roughness])
+        return Terms(guides.log_axis.numpy().T, guides.log_distance.numpy().T, np.log(whole), by_tissue)
 
     def _lobe(self, roughness: float) -> tuple[np.ndarray, np.ndarray]:
-        """The specular lobe [N, K] per unit of f0, and the derivative of its logarithm by roughness."""
-        guides = self.lit.guides
+        """The specular lobe [K, N] per unit of f0, and the derivative of its logarithm by roughness."""
+        cos_o, sin2_m = self.lit.cos_o[:, None], self.lit.guides.sin2_m
 
         def at(roughness: float) -> np.ndarray:
-            rough = torch.tensor(roughness)
-            return shading.specular_lobe(guides.cos_i, self.lit.cos_o[:, None], guides.sin2_m, rough).numpy()
+            return shading.specular_lobe(self._cos_i, cos_o, sin2_m, torch.tensor(roughness)).numpy().T
 
         less, more = (np.log(at(roughness + aside)) for aside in (-ASIDE, ASIDE))
         return at(roughness), (more - less) / (2 * ASIDE)

@@ -13,6 +13,7 @@ vignetting and a gain would explain, none of which is there.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -21,7 +22,16 @@ import numpy as np
 import torch
 
 from endotwin.effects.noise import LEVEL
-from endotwin.evidence.log_light import LIGHT_COLUMNS, TISSUE_MEAN, About, Bounced, LogLight, Tissue
+from endotwin.evidence.log_light import (
+    LEAST_COS,
+    LIGHT_COLUMNS,
+    TISSUE_MEAN,
+    About,
+    Bounced,
+    LogLight,
+    Tissue,
+    log_cos,
+)
 from endotwin.evidence.sightings import Sightings
 from endotwin.evidence.verdict import Halved, Verdict, compared, verdict_of
 from endotwin.light.forward import Lit
@@ -62,9 +72,6 @@ POSSIBLE = ((0.1, 2.0), (-1.0, 12.0), (-0.5, 7.0))
 LEAST_GAMMA = 0.05
 """Less is found where photos tell nothing: a model is not linearised about that."""
 
-LEAST_COS = 0.02
-"""By so much normals err: what turns no more to any guide, and shows light, turns so much to it."""
-
 
 @dataclass(frozen=True)
 class Hypothesis:
@@ -104,6 +111,11 @@ class Fitted:
     def halved(self) -> Halved:
         """The design with the coefficients that either half of the vertices chooses."""
         return Halved.of(self.target, self.design, self.half, len(self.effects.intercepts))
+
+    @property
+    def near(self) -> About:
+        """Where models that are near this one are linearised."""
+        return self.about if self.possible else About()
 
     @property
     def gamma(self) -> float:
@@ -205,8 +217,26 @@ class Probe(Sightings):
     def linearised(self, hypothesis: Hypothesis, base: Fitted, visible: np.ndarray | None = None) -> Design:
         """The design of a hypothesis about ``base``, under guides that see the pixels as ``visible`` [N, K]
         says (found out unless given)."""
-        about = base.about if base.possible else About()
+        about = base.near
         return self._design(hypothesis, log_light(self, hypothesis, visible), about, about.tissue.at_bounds)
+
+    def columns(
+        self,
+        hypothesis: Hypothesis,
+        base: Fitted,
+        sets_mm: np.ndarray,
+        visible: Callable[[np.ndarray], np.ndarray],
+    ) -> np.ndarray:
+        """Columns [M, N, C] of ``linearised`` designs with other guides, M sets of K [M, K, 3]; any guides
+        [U, 3] see the pixels as ``visible`` says, [N, U]. What a guide does that is in several sets is found
+        out once."""
+        guides_mm, sets = np.unique(sets_mm.reshape(-1, 3), axis=0, return_inverse=True)
+        sets = sets.reshape(sets_mm.shape[:2]).T
+        lit, about = _lit(self, guides_mm, hypothesis.profile), base.near
+        cos_i = lit.guides.cos_i.numpy().T
+        terms = LogLight(lit, cos_i, None).terms(about, self.vertex).of(sets)
+        cos_i = shown_to(cos_i[sets], visible(guides_mm).T[sets], hypothesis.bounced is None)
+        return _beside(self, hypothesis, terms.columns(log_cos(cos_i), about, hypothesis.bounced))
 
     def left(self, design: Design, base: Fitted) -> Left:
         """What a design leaves of the pixels, in widths of what ``base`` does."""
@@ -227,7 +257,7 @@ class Probe(Sightings):
         """By how much the mean square of what ``found`` leaves would grow if nothing explained the shadows
         of its guides, each a share of the light, in all pixels, of the probe or not."""
         every = Sightings(self._every, np.zeros(len(self._every), int), self.twin, self.caster)
-        lost = 1 - every.visible_to(found.hypothesis.guides_mm).mean(axis=1)
+        lost = 1 - every.visible(found.hypothesis.guides_mm).mean(axis=1)
         return 10 * math.log10(1 + float(((found.gamma * lost) ** 2).mean()) / found.effects.width**2)
 
     def told_by_shadows(self, cast: Fitted, uncast: Fitted) -> Verdict:
@@ -296,24 +326,30 @@ class Probe(Sightings):
 
 
 def _columns(sightings: Sightings, hypothesis: Hypothesis, light: LogLight, about: About) -> np.ndarray:
-    """Those of the light, of vignetting, of each frame's bounce, and of what drifts, where there are any."""
-    columns, by_bounce = np.split(light.columns(about, sightings.vertex), [LIGHT_COLUMNS], axis=1)
+    """All those of a design, [N, C]."""
+    return _beside(sightings, hypothesis, light.columns(about, sightings.vertex))
+
+
+def _beside(sightings: Sightings, hypothesis: Hypothesis, columns: np.ndarray) -> np.ndarray:
+    """The ``columns`` [..., N, 6 or 7] of the light, with those of vignetting, of each frame's bounce, and of
+    what drifts, where there are any."""
+    columns, by_bounce = np.split(columns, [LIGHT_COLUMNS], axis=-1)
+    parts = [columns]
     if hypothesis.vignetting:
-        columns = np.c_[columns, sightings.vignetting_column]
+        parts.append(sightings.vignetting_column[:, None])
     if hypothesis.uneven:
-        columns = np.c_[columns, by_bounce * (sightings.frame[:, None] == np.arange(len(sightings.frames)))]
+        parts.append(by_bounce * (sightings.frame[:, None] == np.arange(len(sightings.frames))))
     if hypothesis.adrift:
         drifts = sightings.drifts[sightings.frame]
-        columns = np.c_[columns, drifts, by_bounce * drifts]
-    return columns
+        parts += [drifts, by_bounce * drifts]
+    return np.concatenate([np.broadcast_to(x, (*columns.shape[:-1], x.shape[-1])) for x in parts], axis=-1)
 
 
 def log_light(sightings: Sightings, hypothesis: Hypothesis, visible: np.ndarray | None = None) -> LogLight:
     """The light of a hypothesis at sightings that its guides see as ``visible`` [N, K] says (found out unless
     given).
 
-    What shows light is lit, whatever the surface says: no pixel is taken to lie in all guides' shadow, or to
-    turn away from all of them, where nothing else would light it.
+    What shows light is lit, whatever the surface says: see ``shown_to``.
     """
     samples = sightings.samples
     if hypothesis.guides_mm == AT_LENS:
@@ -321,14 +357,23 @@ def log_light(sightings: Sightings, hypothesis: Hypothesis, visible: np.ndarray 
         if hypothesis.profile != COSINE:
             axis = torch.from_numpy(log_axis(axis.exp().numpy(), hypothesis.profile))
         lit = Lit.at_lens(samples.cos, samples.sin2, axis, samples.log_distance)
-        return LogLight(lit, hypothesis.bounced)
+        return LogLight(lit, lit.guides.cos_i.numpy().T, hypothesis.bounced)
     guides_mm = np.asarray(hypothesis.guides_mm, np.float32)
     if hypothesis.shadows and visible is None:
-        visible = sightings.visible_to(guides_mm)
-    if hypothesis.shadows and hypothesis.bounced is None:
-        visible = visible | ~visible.any(axis=1, keepdims=True)
-    lit = guided(sightings.points_mm, sightings.normals, guides_mm, hypothesis.profile, visible)
-    if hypothesis.bounced is None:
-        away = lit.cos_i.amax(dim=1, keepdim=True) < LEAST_COS
-        lit = replace(lit, cos_i=torch.where(away, LEAST_COS, lit.cos_i))
-    return LogLight(Lit(samples.cos, lit), hypothesis.bounced)
+        visible = sightings.visible(guides_mm)
+    lit, seen = _lit(sightings, guides_mm, hypothesis.profile), None if visible is None else visible.T
+    cos_i = shown_to(lit.guides.cos_i.numpy().T, seen, hypothesis.bounced is None)
+    return LogLight(lit, cos_i, hypothesis.bounced)
+
+
+def _lit(sightings: Sightings, guides_mm: np.ndarray, profile: float) -> Lit:
+    """How guides [K, 3] light sightings without shadows."""
+    return Lit(sightings.samples.cos, guided(sightings.points_mm, sightings.normals, guides_mm, profile))
+
+
+def shown_to(cos_i: np.ndarray, visible: np.ndarray | None, alone: bool) -> np.ndarray:
+    """n·ωi [K, ..., N] of the guides that pixels see as ``visible`` says (None: all). Where nothing but them
+    lights what shows light, none of that lies in the shadow of all, or turns away from all."""
+    if visible is not None:
+        cos_i = cos_i * (visible | ~visible.any(axis=0) if alone else visible)
+    return np.where(cos_i.max(axis=0) < LEAST_COS, np.float32(LEAST_COS), cos_i) if alone else cos_i

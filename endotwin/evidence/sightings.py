@@ -87,22 +87,19 @@ class Sightings:
         """Normals in the surface's frame, float32 [N, 3]."""
         return self._interpolated(self.twin.surface.normals)
 
-    def visible(self, guide_mm: np.ndarray, rows: np.ndarray | None = None) -> np.ndarray:
-        """Bool [N]: whether a guide [3] (camera frame) sees each pixel's point (or of those in ``rows``)."""
+    def visible(self, guides_mm: np.ndarray, rows: np.ndarray | None = None) -> np.ndarray:
+        """Bool [N, K]: which of guides [K, 3] (camera frame) see each pixel's point (or of those in
+        ``rows``)."""
         rows = slice(None) if rows is None else rows
         points_mm = self.local_points_mm[rows]
-        return visible_in_views(self.caster, self.T_local_camera, self.frame[rows], points_mm, guide_mm)
-
-    def visible_to(self, guides_mm: np.ndarray) -> np.ndarray:
-        """Bool [N, K]: which of guides [K, 3] see each pixel's point."""
-        return np.stack([self.visible(guide) for guide in np.asarray(guides_mm, np.float32)], axis=1)
+        return visible_in_views(self.caster, self.T_local_camera, self.frame[rows], points_mm, guides_mm)
 
     def lit(self, guides_mm: np.ndarray, shadows: bool) -> np.ndarray:
         """Bool [N]: whether any of guides [K, 3] lies before each point's surface and, with ``shadows``, is
         seen from there."""
         towards = np.asarray(guides_mm, np.float32) - self.points_mm[:, None]
         before = np.einsum("nka,na->nk", towards, self.normals) > 0
-        return (before & self.visible_to(guides_mm) if shadows else before).any(axis=1)
+        return (before & self.visible(guides_mm) if shadows else before).any(axis=1)
 
     @cached_property
     def trust(self) -> np.ndarray:

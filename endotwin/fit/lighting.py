@@ -75,8 +75,7 @@ def _visible(samples: Samples, caster: Caster, guides_mm: np.ndarray) -> np.ndar
     poses, view = samples.views.T_local_camera, samples.views.row(samples.frame)
     points_mm = np.einsum("nab,nb->na", samples.rotation, samples.points_mm)
     points_mm += poses[:, :3, 3].astype(np.float32)[view]
-    seen = [visible_in_views(caster, poses, view, points_mm, guide_mm) for guide_mm in guides_mm]
-    return np.stack(seen, axis=1)
+    return visible_in_views(caster, poses, view, points_mm, guides_mm)
 
 
 def guides_aside(
@@ -118,6 +117,11 @@ class Relighting:
     @property
     def bounces(self) -> bool:
         return self._bouncer is not None
+
+    @property
+    def radiosity(self) -> Radiosity | None:
+        """Of the surface, where light bounces."""
+        return self._bouncer and self._bouncer.radiosity
 
     @property
     def needed(self) -> bool:
@@ -234,20 +238,21 @@ class Bouncer:
     """Interreflection of the training views, renewed from the albedo and the light that the fit has found.
 
     Attributes:
-        light_stays: light and response are held, so that what they change of it is not asked for.
+        radiosity: of the surface. light_stays: light and response are held, so that what they change of it is
+            not asked for.
     """
 
     def __init__(self, surface: Surface, caster: Caster, effects: Effects, views: Views):
         self._surface, self.light_stays = surface, False
         self._placed: tuple[Tensor | None, Places | None] = None, None
-        self._radiosity = Radiosity(surface, caster, effects["interreflection"].cell_mm)
+        self.radiosity = Radiosity(surface, caster, effects["interreflection"].cell_mm)
         self._poses = views.T_local_camera
         self.light_from(effects)
 
     def light_from(self, effects: Effects) -> None:
         """From here on the guides of ``effects`` throw the light that bounces."""
         guides_mm = effects.guides_mm or AT_LENS
-        self._light = BouncedLight(self._radiosity, self._poses, guides_mm, effects.profile)
+        self._light = BouncedLight(self.radiosity, self._poses, guides_mm, effects.profile)
 
     def bounced(
         self, samples: Samples, roughness: Tensor, materials: Tensor, triangles: Tensor, shared: Globals
@@ -258,7 +263,7 @@ class Bouncer:
         scale, lobes = shared.log_scale, shared.lobes.brighter(math.exp(shared.log_scale))
 
         def albedo(base_color: Tensor) -> Albedo:
-            return Albedo.of(self._radiosity, base_color, materials[:, 3], lobes, triangles.numpy())
+            return Albedo.of(self.radiosity, base_color, materials[:, 3], lobes, triangles.numpy())
 
         places, base_color = self._places(samples), materials[:, :3]
         gloss = lobes.gloss(samples.cos, roughness) * torch.tensor([math.exp(-scale), 1.0])
@@ -275,7 +280,7 @@ class Bouncer:
         last."""
         pixel, places = self._placed
         if pixel is not samples.pixel:
-            to_vertex, triangles = self._radiosity.to_vertex, self._surface.triangles
+            to_vertex, triangles = self.radiosity.to_vertex, self._surface.triangles
             view = samples.views.row(samples.frame)
             places = Places(to_vertex[samples.nearest(triangles)], view)
             self._placed = samples.pixel, places

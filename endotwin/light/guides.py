@@ -134,13 +134,17 @@ def visible_from(
 
 
 def visible_in_views(
-    caster: Caster, T_local_camera: np.ndarray, view: np.ndarray, points_mm: np.ndarray, guide_mm: np.ndarray
+    caster: Caster, T_local_camera: np.ndarray, view: np.ndarray, points_mm: np.ndarray, guides_mm: np.ndarray
 ) -> np.ndarray:
-    """Bool [N]: which points [N, 3] (surface's frame), each seen in its ``view`` [N] of those with poses
-    ``T_local_camera`` [M, 4, 4], a guide [3] (camera frame) sees; all in one cast."""
-    guides_mm = (T_local_camera @ np.append(guide_mm, 1.0))[:, :3].astype(np.float32)
-    origins_mm = guides_mm.take(view, axis=0)
-    return _sees(caster, origins_mm, points_mm - origins_mm)
+    """Bool [N, K]: which points [N, 3] (surface's frame), each seen in its ``view`` [N] of those with poses
+    ``T_local_camera`` [M, 4, 4], guides [K, 3] (camera frame) see; all in one cast."""
+    guides_mm = np.asarray(guides_mm)
+    rotated_mm = np.einsum("mab,kb->kma", T_local_camera[:, :3, :3], guides_mm)
+    local_mm = (rotated_mm + T_local_camera[:, :3, 3]).astype(np.float32)
+    origins_mm = local_mm.take(view, axis=1)
+    rays_mm = points_mm - origins_mm
+    seen = _sees(caster, origins_mm.reshape(-1, 3), rays_mm.reshape(-1, 3))
+    return seen.reshape(len(guides_mm), -1).T
 
 
 def _sees(caster: Caster, origins_mm: np.ndarray, rays_mm: np.ndarray) -> np.ndarray:

@@ -13,7 +13,7 @@ from independent.write import make
 
 from endotwin.config import STANDARD
 from endotwin.effects.vignetting import Vignetting
-from endotwin.evidence.bounce import Surroundings
+from endotwin.evidence.bounce import Patches, Surroundings
 from endotwin.evidence.decide import _Trial, decide
 from endotwin.evidence.glints import Glints
 from endotwin.evidence.guide_search import Ground, _judged, _judged_another, found_guides
@@ -281,12 +281,12 @@ def test_shadows_are_cast_by_guides_unless_hardly_a_pixel_lies_in_one_or_many_co
 
     def state(samples, guides_mm) -> str:
         probe = Probe(samples, twin, caster)
-        trial = _Trial(probe, glints, {}, lambda: False, AT_LENS)
+        trial = _Trial(probe, lambda: Patches(probe), glints, {}, lambda: False, AT_LENS)
         trial.shadowed(probe.fit(Hypothesis(tuple(map(tuple, guides_mm)), shadows=True)))
         return trial._decisions["shadows"].state
 
     probe = Probe(samples, twin, caster)
-    shaded = probe._rows[~probe.visible_to(GUIDES_MM).all(axis=1)]
+    shaded = probe._rows[~probe.visible(GUIDES_MM).all(axis=1)]
     few = samples[torch.from_numpy(np.delete(np.arange(len(samples)), shaded[20:]))]
     assert state(samples, GUIDES_MM) == "on" and state(few, GUIDES_MM) == "on"
     assert state(samples, np.multiply(GUIDES_MM, [0.01, 0.01, 1])) == "off"
@@ -300,7 +300,7 @@ def test_guides_that_gain_little_beside_a_bounce_are_borne_out_by_shadows_that_s
 
     def model(guides_mm, bounces: bool = True):
         light = Hypothesis(tuple(map(tuple, guides_mm)), shadows=True)
-        bounced = Surroundings(ground.probe).bounced(light) if bounces else None
+        bounced = Surroundings(ground.probe, Patches(ground.probe)).bounced(light) if bounces else None
         return ground.probe.fit(replace(light, bounced=bounced))
 
     there, nearly_at_lens = model(GUIDES_MM), model(np.multiply(GUIDES_MM, [0.01, 0.01, 1]))
@@ -357,7 +357,8 @@ def test_a_bounce_that_gains_make_up_for_is_told_by_how_usual_light_and_response
     monkeypatch.setattr(Probe, "compare", compared)
     monkeypatch.setattr(Tints, "still", NOTHING)
     wanted = {name: "off" for name in LIGHT if name != "interreflection"}
-    trial = _Trial(Probe(samples, twin, caster), glints, wanted, lambda: False, AT_LENS)
+    probe = Probe(samples, twin, caster)
+    trial = _Trial(probe, lambda: Patches(probe), glints, wanted, lambda: False, AT_LENS)
     trial.together()
     assert trial._decisions["interreflection"].state == state
 
@@ -380,7 +381,7 @@ def test_of_profile_and_vignetting_the_one_that_explains_more_is_decided_first(
 
     monkeypatch.setattr(Probe, "compare", compared)
     probe = Probe(samples, twin, caster)
-    trial = _Trial(probe, glints, {}, lambda: False, AT_LENS)
+    trial = _Trial(probe, lambda: Patches(probe), glints, {}, lambda: False, AT_LENS)
     kept = probe.fit(Hypothesis(((3.0, 0.0, 0.0),)))
     assert trial.stronger_first(kept)[0] == first
 

@@ -10,7 +10,7 @@ import torch
 from independent.light import burley, ggx
 
 from endotwin.config import STANDARD
-from endotwin.evidence.bounce import Surroundings
+from endotwin.evidence.bounce import Patches, Surroundings
 from endotwin.evidence.light_map import LightMap, places_mm
 from endotwin.evidence.probe import LEAST_COS, Hypothesis, Probe, log_light
 from endotwin.evidence.sightings import Sightings
@@ -79,7 +79,7 @@ def exposed(probe: Probe, even: Hypothesis, log_gain: np.ndarray, log_bounce: np
 
 def test_a_gain_and_a_bounce_that_errs_from_frame_to_frame_are_told_apart(example):
     """As strong as they pass for each other: each is the better model of what it made itself."""
-    even = Hypothesis(bounced=Surroundings(example).bounced(Hypothesis()))
+    even = Hypothesis(bounced=Surroundings(example, Patches(example)).bounced(Hypothesis()))
     wander = np.sin(np.arange(len(example.frames)))
 
     def verdict(log_gain: float, log_bounce: float) -> Verdict:
@@ -93,7 +93,7 @@ def test_a_gain_and_a_bounce_that_errs_from_frame_to_frame_are_told_apart(exampl
 
 
 def test_a_gain_that_flickers_is_told_beside_all_that_drifts_along_the_path_and_what_drifts_is_none(example):
-    even = Hypothesis(bounced=Surroundings(example).bounced(Hypothesis()))
+    even = Hypothesis(bounced=Surroundings(example, Patches(example)).bounced(Hypothesis()))
     frames = np.arange(len(example.frames))
 
     def verdict(log_gain: np.ndarray, log_bounce: np.ndarray) -> Verdict:
@@ -130,7 +130,7 @@ def test_a_map_of_the_light_shows_from_where_it_comes_and_where_its_guides_stand
         towards = guide_mm - example.points_mm
         distance = np.linalg.norm(towards, axis=1)
         wi = towards / distance[:, None]
-        lit = example.visible(guide_mm) * np.maximum((wi * example.normals).sum(axis=1), 0)
+        lit = example.visible(guide_mm[None])[:, 0] * np.maximum((wi * example.normals).sum(axis=1), 0)
         light = light + lit * (-wi[:, 2]) ** 2.5 / distance**2
     albedo = (0.5 * np.exp(rng.normal(0, 0.2, example.count)))[example.vertex]
     rows = np.flatnonzero(light > 0)
@@ -151,7 +151,7 @@ def test_a_map_of_the_light_shows_from_where_it_comes_and_where_its_guides_stand
     probe.target = np.log((albedo * light)[rows]) / 2.2 + rng.normal(0, 0.01, len(rows))
     radius_mm = 2.4
     places = places_mm(radius_mm)
-    visible = probe.visible_to(places)
+    visible = probe.visible(places)
     found = LightMap.of(probe, probe.fit(Hypothesis()), places, visible)
     apart_mm = np.linalg.norm(found.places_mm[:, None] - guides_mm, axis=2)
     assert found.share[apart_mm.min(axis=1) < radius_mm].sum() > 0.8
@@ -165,7 +165,7 @@ def test_a_map_of_the_light_is_one_whatever_the_photos_show(example, spread):
     probe, radius_mm = copy.copy(example), 2.4
     probe.target = spread * np.random.default_rng(3).normal(size=len(probe))
     places = places_mm(radius_mm)
-    visible = probe.visible_to(places)
+    visible = probe.visible(places)
     visible[:: len(visible) // 1000] = False
     found = LightMap.of(probe, probe.fit(Hypothesis()), places, visible)
     assert (found.share >= 0).all() and found.share.sum() == pytest.approx(1)
@@ -186,9 +186,9 @@ def test_what_shows_light_is_not_taken_to_turn_away_from_it_unless_other_tissue_
     assert away.any() and not away.all()
     np.testing.assert_array_equal(example.lit(far.guides_mm, shadows=False), ~away)
     alone = log_light(example, far)
-    np.testing.assert_allclose(alone.lit.guides.cos_i[:, 0], np.maximum(cos, LEAST_COS), atol=1e-6)
-    among = log_light(example, replace(far, bounced=Surroundings(example).bounced(far)))
-    np.testing.assert_allclose(among.lit.guides.cos_i[:, 0], np.maximum(cos, 0), atol=1e-6)
+    np.testing.assert_allclose(alone.cos_i[0], np.maximum(cos, LEAST_COS), atol=1e-6)
+    among = log_light(example, replace(far, bounced=Surroundings(example, Patches(example)).bounced(far)))
+    np.testing.assert_allclose(among.cos_i[0], np.maximum(cos, 0), atol=1e-6)
 
 
 def test_shadows_are_told_by_pixels_that_show_no_light(example):
@@ -207,3 +207,23 @@ def test_shadows_are_told_by_pixels_that_show_no_light(example):
 def test_where_nothing_is_judged_nothing_is_gained_or_lost():
     verdict = verdict_of(np.zeros(5), 0.0)
     assert (verdict.gain_db, verdict.sigmas) == (0.0, 0.0)
+
+
+@pytest.mark.parametrize("bounces", [False, True])
+@pytest.mark.parametrize("vignetting", [False, True])
+def test_many_sets_of_guides_have_the_columns_of_each_alone(example, bounces, vignetting):
+    guides_mm = np.float32([[4, 0, 0], [-3, 1, 0], [0, -30, -1]])
+    sets_mm = guides_mm[[[0, 1], [2, 1], [0, 2]]]
+    bounced = Surroundings(example, Patches(example)).bounced(Hypothesis()) if bounces else None
+    light = Hypothesis(shadows=True, vignetting=vignetting, bounced=bounced)
+    base = example.fit(light)
+    found = example.columns(light, base, sets_mm, example.visible)
+    for set_mm, columns in zip(sets_mm, found, strict=True):
+        one = replace(light, guides_mm=tuple(map(tuple, set_mm.tolist())))
+        np.testing.assert_allclose(columns, example.linearised(one, base).columns, atol=1e-4)
+
+
+def test_what_several_guides_see_is_what_each_sees(example):
+    guides_mm = np.float32([[4, 0, 0], [-3, 1, 0], [0, -30, -1]])
+    each = [example.visible(guide_mm[None])[:, 0] for guide_mm in guides_mm]
+    np.testing.assert_array_equal(example.visible(guides_mm), np.stack(each, axis=1))
