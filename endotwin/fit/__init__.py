@@ -4,15 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from endotwin.config import METHODS, STANDARD, FitConfig
 from endotwin.effects import RENDERED, checked_states
 from endotwin.errors import OptionError
 from endotwin.pixels.pace import Pace
-from endotwin.pixels.samples import Views
 from endotwin.run.threads import device_of
-from endotwin.surface.casting import Caster
 from endotwin.twin import Twin
+
+if TYPE_CHECKING:
+    from endotwin.fit.solve import Price
 
 
 def fit(
@@ -23,7 +25,7 @@ def fit(
     progress: Callable[[str, int, int], None] | None = None,
     checkpoint: Path | None = None,
     effects: Mapping[str, str] | None = None,
-    price: Callable[[Twin, Caster, Views], Twin] = lambda twin, caster, views: twin,
+    price: Price = lambda twin, caster, views, radiosity: twin,
     device: str = "cpu",
 ) -> Twin:
     """The twin with materials, light and response fitted to its training photos.

@@ -38,6 +38,7 @@ from endotwin.fit.tilt import Tilter
 from endotwin.fit.unexplained import Remains, odd_photos_warning, residual_warning
 from endotwin.light.film import Film
 from endotwin.light.guides import AT_LENS
+from endotwin.light.radiosity import Radiosity
 from endotwin.pixels.length_unit import unit_mm
 from endotwin.pixels.pace import ITERATIONS, Pace
 from endotwin.pixels.samples import Samples, Views, drawn, gather, whole_groups
@@ -49,7 +50,7 @@ from endotwin.twin import Light, Materials, Response, Twin
 
 logger = logging.getLogger("endotwin")
 
-Price = Callable[[Twin, Caster, Views], Twin]
+Price = Callable[[Twin, Caster, Views, Radiosity | None], Twin]
 
 LIGHT_PIXELS = 150_000
 LIGHT_SHARE = 0.25
@@ -124,7 +125,7 @@ def fit_twin(
         for effect in beyond:
             effects = effects.including(effect)
         fitted = _fitted(twin, wet.model.state, effects, decisions, wet.film)
-        priced = price(fitted, fit.caster, samples.views)
+        priced = price(fitted, fit.caster, samples.views, relighting.radiosity)
     sharpened, casts = samples.views.processor, lighted.decided.casts
     return priced.with_record(
         fit={

@@ -26,23 +26,36 @@ class Illumination:
     """The light of one twin; makes only what the twin's effects ask for.
 
     Args:
-        before: that of another edit of the same twin; what the edits have in common is not made again. Form
-            factors are kept through edits that have no use for them.
+        radiosity: of the twin's surface, if it is known.
     """
 
-    def __init__(self, twin: Twin, caster: Caster, before: Illumination | None = None):
+    def __init__(self, twin: Twin, caster: Caster, radiosity: Radiosity | None = None):
         self.twin = twin
         self._caster = caster
-        self._radiosity = before._radiosity if before else None
-        self._albedo = None
-        if twin.effects.bounce > 0:
-            cell_mm = twin.effects["interreflection"].cell_mm
-            if self._radiosity is None or self._radiosity.cell_mm != cell_mm:
-                self._radiosity = Radiosity(twin.surface, caster, cell_mm)
-            elif before.twin.materials is twin.materials and _lobes(before.twin) == _lobes(twin):
-                self._albedo = before._albedo
-            if self._albedo is None:
-                self._albedo = _albedo(twin, self._radiosity)
+        self._radiosity, self._albedo = radiosity, None
+        self._bounce()
+
+    def edited(self, twin: Twin) -> Illumination:
+        """That of another edit of the same twin; what the edits have in common is not made again. Form
+        factors are kept through edits that have no use for them."""
+        other = copy(self)
+        other.twin = twin
+        if twin.materials is not self.twin.materials or _lobes(twin) != _lobes(self.twin):
+            other._albedo = None
+        other._bounce()
+        return other
+
+    def _bounce(self) -> None:
+        """Make what bounces light, where it bounces."""
+        effects = self.twin.effects
+        if effects.bounce <= 0:
+            self._albedo = None
+            return
+        cell_mm = effects["interreflection"].cell_mm
+        if self._radiosity is None or self._radiosity.cell_mm != cell_mm:
+            self._radiosity, self._albedo = Radiosity(self.twin.surface, self._caster, cell_mm), None
+        if self._albedo is None:
+            self._albedo = _albedo(self.twin, self._radiosity)
 
     def moved(self, twin: Twin, caster: Caster) -> Illumination:
         """That of ``twin`` on the moved surface of ``caster``, which has the same triangles. Tissue throws

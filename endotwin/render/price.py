@@ -14,6 +14,7 @@ from endotwin.effects.lens import Lens
 from endotwin.render.renderer import Renderer
 
 if TYPE_CHECKING:
+    from endotwin.light.radiosity import Radiosity
     from endotwin.pixels.samples import Views
     from endotwin.surface.casting import Caster
     from endotwin.twin import Twin
@@ -25,14 +26,15 @@ LEAST_S = 0.3
 """Renderings are repeated for so long: the best of several small ones, a single large one."""
 
 
-def priced(twin: Twin, caster: Caster, views: Views) -> Twin:
+def priced(twin: Twin, caster: Caster, views: Views, radiosity: Radiosity | None = None) -> Twin:
     """``twin`` with the price of each effect that is on in its decisions, by the middle one of ``views``, and
-    those only rendered in them too."""
+    those only rendered in them too. ``caster`` and ``radiosity`` as of ``Renderer``."""
     decisions = {**_rendered(views), **twin.decisions}
     pose = twin.surface.to_world(views.T_local_camera[len(views.frames) // 2])
     dear = [name for name in twin.effects if name in decisions and name not in FREE]
     if dear:
-        whole = Renderer(twin, caster=caster)
+        whole = Renderer(twin, caster=caster, radiosity=radiosity)
+        find_once(whole, pose)
         whole_ms = frame_ms(whole, pose)
         for name in dear:
             gone = {"offset": ("offset", "shadows")}.get(name, (name,))
@@ -43,6 +45,13 @@ def priced(twin: Twin, caster: Caster, views: Views) -> Twin:
                 memory_mb=round(whole.nbytes / 1e6, 1) if name == "interreflection" else 0.0,
             )
     return replace(twin, decisions=decisions)
+
+
+def find_once(renderer: Renderer, T_world_camera: np.ndarray) -> None:
+    """Render a pixel from there: what is found once for all views is no view's price."""
+    pixel = np.zeros((renderer.camera.height, renderer.camera.width), bool)
+    pixel[renderer.camera.height // 2, renderer.camera.width // 2] = True
+    renderer.view(T_world_camera, pixel)
 
 
 def frame_ms(renderer: Renderer, T_world_camera: np.ndarray) -> float:

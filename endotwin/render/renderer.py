@@ -16,6 +16,7 @@ from endotwin.cameras import Camera, as_camera
 from endotwin.errors import OptionError
 from endotwin.light.forward import Lit
 from endotwin.light.incidence import to_camera
+from endotwin.light.radiosity import Radiosity
 from endotwin.render.illumination import Illumination, ViewLight
 from endotwin.render.sparkles import rough_mm2, sparkles
 from endotwin.run.threads import THREADS
@@ -106,7 +107,8 @@ class Renderer:
 
     Args:
         twin: or its folder. camera: the twin's own unless given. threads: of the ray casting.
-        caster: one of the same surface, to share. exposure: factor on the radiance, one or one a channel.
+        caster, radiosity: those of the same surface, to share. exposure: factor on the radiance, one or one a
+            channel.
     """
 
     def __init__(
@@ -116,13 +118,14 @@ class Renderer:
         threads: int = THREADS,
         caster: Caster | None = None,
         exposure: Sequence[float] | float = 1.0,
+        radiosity: Radiosity | None = None,
     ):
         twin = as_twin(twin)
         twin.require_fitted()
         self.twin = twin
         self.camera = twin.camera if camera is None else as_camera(camera)
         self.caster = caster or Caster(twin.surface, threads)
-        self._illumination = Illumination(twin, self.caster)
+        self._illumination = Illumination(twin, self.caster, radiosity)
         self._exposure = np.asarray(exposure, np.float32)
         self._material = _material(twin)
         self._rough_mm2 = rough_mm2(twin)
@@ -131,11 +134,12 @@ class Renderer:
         """The renderer of another edit of the same twin; what the edits have in common is not made again."""
         other = copy(self)
         other.twin, other._exposure = twin, np.asarray(exposure, np.float32)
-        other._illumination = Illumination(twin, self.caster, before=self._illumination)
+        other._illumination = self._illumination.edited(twin)
         if twin.materials is not self.twin.materials:
             other._material = _material(twin)
         other._rough_mm2 = rough_mm2(twin)
-        vars(other).pop("_transmission", None)
+        if twin.effects.get("vignetting") != self.twin.effects.get("vignetting"):
+            vars(other).pop("_transmission", None)
         return other
 
     def moved(self, caster: Caster) -> Renderer:
