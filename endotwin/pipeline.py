@@ -13,8 +13,6 @@ from typing import TYPE_CHECKING
 from endotwin.config import STANDARD, Config, FitConfig, FuseConfig, load_config
 from endotwin.effects import checked_states
 from endotwin.errors import OptionError, SequenceError, TwinError
-from endotwin.fit import fit
-from endotwin.render.price import priced
 from endotwin.run.arguments import as_path, check_positive, check_progress, check_whole
 from endotwin.run.stopwatch import Stopwatch
 from endotwin.sequence.readers import open_sequence
@@ -171,6 +169,9 @@ def fit_twin(
         OptionError: an option makes no sense. SequenceError: the twin's sequence has moved or cannot be read.
         TwinError: polyps were grown on the twin.
     """
+    from endotwin.fit import fit
+    from endotwin.render.price import priced
+
     check_progress(progress)
     if budget_s is not None:
         budget_s = check_positive("budget", budget_s)
