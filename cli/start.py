@@ -13,11 +13,12 @@ def _leave(number: int, frame: FrameType | None) -> None:
 
 signal.signal(signal.SIGINT, _leave)
 
-from endotwin.cli.stop import Stopped, end_if_told, heed_signals, lose_patience, tell  # noqa: E402
+from endotwin.cli.stop import Stopped, end, end_if_told, heed_signals, lose_patience, tell  # noqa: E402
 
 
 def main() -> None:
     """Run the command line."""
+    code = 0
     try:
         heed_signals()
         lose_patience()
@@ -25,10 +26,14 @@ def main() -> None:
 
         run()
     except Stopped as stopped:
-        sys.exit(tell(stopped))
+        code = tell(stopped)
+    except SystemExit as ended:
+        code = ended.code or 0
     finally:
         signal.signal(signal.SIGINT, signal.SIG_IGN)  # nothing is left to stop
         end_if_told()
+    end(code)
+    sys.exit(code)
 
 
 if __name__ == "__main__":

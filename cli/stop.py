@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import _thread
+import atexit
 import os
 import signal
 import socket
@@ -49,19 +50,25 @@ def tell(stopped: Stopped) -> int:
 
 
 def end_if_told() -> None:
-    """End the process at once where it was stopped, be it in the moment in which it ended by itself.
+    """End the process where it was stopped, be it in the moment in which it ended by itself.
 
-    Graphics and tensors take seconds to be unloaded, and Python drops its handlers before the second try of
-    a signal that was put off.
+    Python drops its handlers before the second try of a signal that was put off.
     """
     if _put_off and not _told:
         print("stopped", file=sys.stderr)
         _told.append(128 + _put_off[0])
     if _told:
-        with suppress(OSError):
-            sys.stdout.flush()
-            sys.stderr.flush()
-        os._exit(_told[0])
+        end(_told[0])
+
+
+def end(code: int) -> None:
+    """End the process at once: graphics and tensors would take a second or more to be unloaded. What cannot
+    be written to stdout or stderr any more is left to Python, which says so."""
+    with suppress(OSError):
+        atexit._run_exitfuncs()
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(code)
 
 
 def lose_patience() -> None:
