@@ -33,7 +33,7 @@ COLUMNS = (
     "PSNR covered",
 )
 
-COMMAND = ("-m", "endotwin.cli.main")
+COMMAND = ("-m", "endotwin.cli.start")
 EVERY_FRAME = (
     "-c",
     "import endotwin.cli.main as cli, endotwin.fusion as f; f.WORTH_PIXELS = 1e99; cli.main()",

@@ -24,9 +24,14 @@ import cv2
 import numpy as np
 from scipy.spatial import cKDTree
 
+sys.path.append(str(Path(__file__).parent))
+
+from decisions import apart_mm
+
 from endotwin.evaluation.evaluation import covered_pixels
 from endotwin.fit.solve import median_edge_mm
 from endotwin.fusion._open3d import o3d
+from endotwin.light.guides import AT_LENS
 from endotwin.render import Renderer
 from endotwin.surface import Surface
 from endotwin.twin import Twin
@@ -42,7 +47,7 @@ NEAR_EDGES = 2.0
 
 def run(*arguments: object, profile: Path) -> tuple[str, float, dict]:
     """One endotwin command: what it printed, its seconds (Python's start included), its profile."""
-    command = [sys.executable, "-m", "endotwin.cli.main", *map(str, arguments), "--profile", str(profile)]
+    command = [sys.executable, "-m", "endotwin.cli.start", *map(str, arguments), "--profile", str(profile)]
     started = time.perf_counter()
     done = subprocess.run(command, stdout=subprocess.PIPE, text=True, encoding="utf-8")
     if done.returncode:
@@ -100,10 +105,19 @@ def mesh_error(twin: Twin, truth: Path) -> str:
     return f"{scene.compute_distance(world_mm).numpy().mean():.3f} mm"
 
 
-def true_light(made: dict) -> dict[str, float]:
-    """γ, n and q of the scene's description."""
+def true_light(made: dict) -> dict:
+    """γ, n, q and where guides stand, of the scene's description."""
     light = made.get("light", {"n": made.get("spread"), "q": FALLOFF})
-    return {"gamma": made.get("gamma", GAMMA), "n": light["n"], "q": light["q"]}
+    guides_mm = made.get("lights", AT_LENS)
+    return {"gamma": made.get("gamma", GAMMA), "n": light["n"], "q": light["q"], "guides_mm": guides_mm}
+
+
+def guides_apart(twin: Twin, true_mm: list) -> str:
+    """Mean distance of the twin's guides from the true ones, if there are as many beside the lens."""
+    found_mm = twin.effects.guides_mm or AT_LENS
+    if len(found_mm) != len(true_mm):
+        return f"{len(found_mm)} of {len(true_mm)}"
+    return f"{apart_mm(found_mm, true_mm):.2f} mm" if np.any([found_mm, true_mm]) else "-"
 
 
 def aligned(twin: Twin) -> str:
@@ -159,6 +173,7 @@ def benchmark(
         "γ": percent(scores["gamma"], truth["gamma"]),
         "n": percent(scores["light"]["n"], truth["n"]),
         "q": percent(scores["light"]["q"], truth["q"]),
+        "guides": guides_apart(twin, truth["guides_mm"]),
         "albedo RMSE": "-" if np.isnan(albedo) else f"{albedo:.4f}",
         "roughness RMSE": "-" if np.isnan(roughness) else f"{roughness:.4f}",
         "mesh": mesh_error(twin, sequence / "truth" / "colon.ply"),

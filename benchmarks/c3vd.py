@@ -114,7 +114,7 @@ def found(root: Path) -> dict[str, Path]:
 
 def endotwin(*arguments: object) -> subprocess.CompletedProcess:
     """One command, in a process of its own."""
-    command = [sys.executable, "-m", "endotwin.cli.main", *map(str, arguments)]
+    command = [sys.executable, "-m", "endotwin.cli.start", *map(str, arguments)]
     return subprocess.run(command, capture_output=True, text=True, encoding="utf-8")
 
 

@@ -45,7 +45,7 @@ def timed(arguments: list[str], files: Iterable[Path], work: Path) -> tuple[str,
     """
     profile = work / "profile.json"
     cool(files)
-    command = [sys.executable, "-m", "endotwin.cli.main", *arguments, "--profile", str(profile)]
+    command = [sys.executable, "-m", "endotwin.cli.start", *arguments, "--profile", str(profile)]
     started = time.perf_counter()
     done = subprocess.run(command, cwd=work, capture_output=True, text=True, encoding="utf-8")
     seconds = time.perf_counter() - started
