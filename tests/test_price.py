@@ -33,7 +33,7 @@ def priced(twin):
 
 
 def test_what_is_found_once_for_all_pictures_is_no_pictures_price(twin, monkeypatch):
-    found, frames, rendered = [], [], price.frame_ms
+    found, pictures, timed = [], [], price.best_ms
 
     def spied(whole, name: str):
         def spy(*args):
@@ -42,17 +42,17 @@ def test_what_is_found_once_for_all_pictures_is_no_pictures_price(twin, monkeypa
 
         return spy
 
-    def frame_ms(renderer, pose) -> float:
+    def best_ms(render) -> float:
         found.clear()
-        rendered(renderer, pose)
-        frames.append(list(found))
-        return 1.0
+        ms = timed(render)
+        pictures.append(list(found))
+        return ms
 
     for where, name in ((Radiosity, "to_points"), (Radiosity, "_counted"), (Vignetting, "transmission")):
         monkeypatch.setattr(where, name, spied(getattr(where, name), name))
-    monkeypatch.setattr(price, "frame_ms", frame_ms)
+    monkeypatch.setattr(price, "best_ms", best_ms)
     priced(twin)
-    assert frames == [[], [], []]
+    assert pictures == [[], [], []]
 
 
 def test_a_renderer_with_the_form_factors_of_its_surface_renders_the_same(twin):

@@ -34,7 +34,6 @@ def priced(twin: Twin, caster: Caster, views: Views, radiosity: Radiosity | None
     dear = [name for name in twin.effects if name in decisions and name not in FREE]
     if dear:
         whole = Renderer(twin, caster=caster, radiosity=radiosity)
-        find_once(whole, pose)
         whole_ms = frame_ms(whole, pose)
         for name in dear:
             gone = {"offset": ("offset", "shadows")}.get(name, (name,))
@@ -47,15 +46,12 @@ def priced(twin: Twin, caster: Caster, views: Views, radiosity: Radiosity | None
     return replace(twin, decisions=decisions)
 
 
-def find_once(renderer: Renderer, T_world_camera: np.ndarray) -> None:
-    """Render a pixel from there: what is found once for all views is no view's price."""
+def frame_ms(renderer: Renderer, T_world_camera: np.ndarray) -> float:
+    """Milliseconds of the view from ``T_world_camera`` [4, 4], less what is found once for all views: a pixel
+    is rendered before."""
     pixel = np.zeros((renderer.camera.height, renderer.camera.width), bool)
     pixel[renderer.camera.height // 2, renderer.camera.width // 2] = True
     renderer.view(T_world_camera, pixel)
-
-
-def frame_ms(renderer: Renderer, T_world_camera: np.ndarray) -> float:
-    """Milliseconds of the view from ``T_world_camera`` [4, 4]."""
     return best_ms(lambda: renderer.view(T_world_camera))
 
 
