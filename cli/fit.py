@@ -13,8 +13,8 @@ from endotwin.effects import parse_states
 from endotwin.errors import OutputError
 from endotwin.run.output import TWIN, check_free
 
-AROUND = 0.5
-"""Python's start before the stopwatch's and its end after it, in shares of the time that the imports took."""
+AROUND = 0.2
+"""Python's start before the stopwatch's, in shares of the time that the imports took."""
 
 LEAST_S = 0.1
 """A budget already spent on the start still asks for the least that a fit can be."""

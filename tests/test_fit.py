@@ -3,6 +3,7 @@
 import json
 import logging
 import shutil
+import time
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
@@ -18,10 +19,10 @@ from endotwin.config import FitConfig
 from endotwin.effects.processor import Processor
 from endotwin.effects.tone import Tone
 from endotwin.evaluation.evaluation import covered_pixels
-from endotwin.fit import fit
+from endotwin.fit import fit, gauss_newton, solve
 from endotwin.fit.solve import median_edge_mm
 from endotwin.pixels.pace import Pace
-from endotwin.pixels.samples import BLACK, frame_samples, gather
+from endotwin.pixels.samples import BLACK, Samples, frame_samples, gather
 from endotwin.surface.casting import Caster
 from endotwin.surface.cells import merged
 
@@ -200,6 +201,36 @@ def test_a_budget_too_small_still_gives_a_finite_twin_in_about_the_least_time(tu
         assert np.isfinite(value).all() and value.min() >= 0 and value.max() <= 1
     assert np.isfinite([twin.light.L0, twin.light.n, twin.light.q, twin.response.gamma]).all()
     assert endotwin.evaluate(twin).psnr > 20
+
+
+def test_where_decisions_took_the_lights_time_its_first_step_is_whole_and_a_detail_has_pixels_of_its_vertices(
+    tube, monkeypatch
+):
+    cut, drawn = [], []
+
+    def decided_late(*args):
+        *_, late, _ = args
+        while not late():
+            time.sleep(0.01)
+        return decide(*args)
+
+    def solved(product, right, inverse, out_of_time, *more):
+        cut.append(out_of_time())
+        return conjugate_gradients(product, right, inverse, out_of_time, *more)
+
+    def thinned(samples, count, generator):
+        drawn.append(count)
+        return take(samples, count, generator)
+
+    decide, conjugate_gradients = solve.decide, gauss_newton.conjugate_gradients
+    take = Samples.thinned
+    monkeypatch.setattr(solve, "decide", decided_late)
+    monkeypatch.setattr(gauss_newton, "conjugate_gradients", solved)
+    monkeypatch.setattr(Samples, "thinned", thinned)
+    monkeypatch.setattr(solve, "SUMS", 0.0)
+    endotwin.fit_twin(tube, budget_s=6)
+    assert not cut[0]
+    assert drawn[0] == solve.LEAST_A_VERTEX * np.count_nonzero(tube.surface.seen_by)
 
 
 def test_black_photos_give_a_finite_twin_and_a_warning(tmp_path, caplog):

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from endotwin.config import FitConfig
-from endotwin.fit.light_stage import Cost
+from endotwin.fit.light_stage import UNCACHED, Cost
 from endotwin.pixels.pace import ITERATIONS, Pace, spread_order
 
 
@@ -66,8 +66,8 @@ def test_light_has_a_third_of_what_is_left_even_where_its_share_is_used_up():
 
 def test_the_detail_costs_what_the_lights_step_did_by_its_weights_its_pixels_and_its_steps():
     cost = Cost(setup_s=1, step_s=5, solve_s=2, weights=10, pixels=100)
-    assert cost.detail_s(weights=10, pixels=100, steps=1) == cost.setup_s + cost.step_s
-    assert cost.detail_s(weights=20, pixels=300, steps=2) == 2 * 1 + 2 * (2 * 2 + 3 * 3)
+    assert cost.detail_s(weights=10, pixels=100, steps=1) == 1 + UNCACHED * 2 + 3
+    assert cost.detail_s(weights=20, pixels=300, steps=2) == 2 * 1 + 2 * (2 * UNCACHED * 2 + 3 * 3)
     assert cost.least_s(weights=20) == cost.detail_s(weights=20, pixels=0, steps=1)
 
 

@@ -17,6 +17,8 @@ import scipy.sparse
 import torch
 from torch import Tensor
 
+from endotwin.run.ahead import on_all_cores
+
 warnings.filterwarnings("ignore", message="Sparse CSR tensor support is in beta state")
 warnings.filterwarnings("ignore", message="Sparse invariant checks are implicitly disabled")
 
@@ -24,9 +26,8 @@ PRIMES = (1, 2_654_435_761, 805_459_861)
 """Factors of the spatial hash, one a dimension (Müller et al. 2022, eq. 4)."""
 
 HASH_ORIGIN = -100_003
-"""Corner that is hashed as (0, 0, 0), far from any scene and off the hash's period of 2**log2_slots. About
-it corners
-collide with their mirror images, since in two's complement −a ^ −b = a ^ b for odd a and b."""
+"""Corner that is hashed as (0, 0, 0), far from any scene and off the hash's period of 2**log2_slots. About it
+corners collide with their mirror images, since in two's complement −a ^ −b = a ^ b for odd a and b."""
 
 
 @dataclass(frozen=True)
@@ -119,25 +120,22 @@ class HashOperator:
     @classmethod
     def of(cls, points_mm: np.ndarray, grid: HashGrid) -> HashOperator:
         """The operator of ``grid`` at points float [V, 3]."""
-        columns, weights, level, slots, rows = [], [], [], [], 0
-        for number, cell_mm in enumerate(grid.cells_mm):
+
+        def one(cell_mm: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
             slot, weight = corner_slots(points_mm, cell_mm, grid.log2_slots)
             occupied = np.zeros(1 << grid.log2_slots, bool)
             occupied[slot] = True
-            used = np.flatnonzero(occupied)
-            columns.append((np.cumsum(occupied) - 1)[slot] + rows)
-            weights.append(weight)
-            level.append(np.full(len(used), number))
-            slots.append(used)
-            rows += len(used)
-        columns, weights = np.concatenate(columns, axis=1), np.concatenate(weights, axis=1)
-        starts = np.arange(0, columns.size + 1, columns.shape[1])
-        matrix = scipy.sparse.csr_matrix(
-            (weights.ravel().astype(np.float32), columns.ravel(), starts), (len(points_mm), rows)
-        )
+            row = np.cumsum(occupied, dtype=np.int32) - 1
+            return row[slot], weight.astype(np.float32), np.flatnonzero(occupied)
+
+        columns, weights, slots = zip(*on_all_cores(one, grid.cells_mm), strict=True)
+        first = np.cumsum([0, *map(len, slots)], dtype=np.int32)
+        columns = np.concatenate([each + start for each, start in zip(columns, first, strict=False)], axis=1)
+        weights, starts = np.concatenate(weights, axis=1), np.arange(0, columns.size + 1, columns.shape[1])
+        shape = len(points_mm), first[-1]
         return cls(
-            to_torch(matrix),
-            np.concatenate(level),
+            to_torch(scipy.sparse.csr_matrix((weights.ravel(), columns.ravel(), starts), shape)),
+            np.repeat(np.arange(len(slots)), np.diff(first)),
             np.concatenate(slots),
             grid.cells_mm,
             grid.log2_slots,

@@ -59,6 +59,9 @@ MOVES, AT_REST = 3, 2e-3
 LEAVING = 2
 """Steps in which light learns to do without what is faint, before the materials do."""
 
+UNCACHED = 3.0
+"""So many times longer takes a weight of a table that no cache holds than one of this stage's, in solving."""
+
 CONVERGED, STEADY = 2e-4, 2e-3
 """A step that changes the cost by a smaller share than this is the last; and so is one of light that bounces
 that changes γ, n, q and the coat by smaller ones: a tenth of what photos tell of them."""
@@ -87,12 +90,12 @@ class Cost:
 
     def least_s(self, weights: int) -> float:
         """Seconds of setting up, and of a step without pixels, with so many ``weights``."""
-        return (self.setup_s + self.solve_s) * weights / self.weights
+        return (self.setup_s + UNCACHED * self.solve_s) * weights / self.weights
 
     def detail_s(self, weights: int, pixels: int, steps: int) -> float:
         """Seconds of so many ``steps`` with more weights and pixels; rather too many, since some of what a
         step does with pixels takes no longer with more."""
-        solve_s = (steps - 1) * self.solve_s * weights / self.weights
+        solve_s = (steps - 1) * UNCACHED * self.solve_s * weights / self.weights
         return self.least_s(weights) + solve_s + steps * self.sums_s * pixels / self.pixels
 
 

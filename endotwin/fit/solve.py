@@ -10,6 +10,7 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -66,6 +67,9 @@ DETAIL_COARSEST_MM = 2.56
 
 SUMS = 0.4
 """Share of the time left for the detail that going through its pixels once may take."""
+
+LEAST_A_VERTEX = 2
+"""Of pixels, those of the detail, on average and whatever the budget: with fewer most of it is a guess."""
 
 CERTAIN_NORMAL_DEG = 5.0
 """A triangle whose vertex normals differ by more bends too much for its normal to be certain."""
@@ -275,6 +279,7 @@ class _Fit:
                 wanted["coat"] = "off"
             parts = telling, samples[pixels.white]
             found = before and before.found
+            self.pace.leave(math.inf)
             stage = LightStage(*parts, surface, start, self.pace, relighting, wanted, self.device, found)
             self.pace.leave(stage.cost.detail_s(self._weights, len(samples), self.pace.plan.steps))
             return _Lighted(decided, samples, start, relighting, stage.cost, stage.found())
@@ -291,13 +296,16 @@ class _Fit:
         return start_at(shown, *mesh, n, q, gamma)
 
     def _decided(self, pixels: _Pixels, shown: Samples, start: Start, near_mm: Guides) -> Decided:
-        """The effects that photos which look as ``shown`` tell; guides are sought first ``near_mm``."""
+        """The effects that photos which look as ``shown`` tell; guides are sought first ``near_mm``. Glints
+        are looked for beside what is decided without them."""
 
         def glints() -> Glints:
             return Glints.of(shown[pixels.smooth], self.twin.surface, start)
 
         late, telling = self.pace.light_is_over, shown[pixels.telling]
-        with one_core():
+        with one_core(), ThreadPoolExecutor(1) as beside:
+            if self.states.get("offset") != "off":
+                glints = beside.submit(glints).result
             return decide(telling, self.twin, self.caster, glints, self.states, late, near_mm)
 
     def detail(self, lighted: _Lighted, samples: Samples) -> tuple[State, np.ndarray, Remains | None]:
@@ -312,12 +320,12 @@ class _Fit:
         operator, samples = finer
         relighting.keep_light()
         unit, mesh = unit_mm(surface), surface.triangles
-        solver = GaussNewton(samples, mesh, operator, unit, 0, pace.out_of_time, self.device)
+        solver = GaussNewton(samples, mesh, operator, unit, device=self.device)
         table = torch.zeros(operator.forward_csr.shape[1], 4)
         state = without = State(operator, at_vertices, table, coarse.shared, solver.pattern.told)
         step_s = 0.0
         for number in range(pace.plan.steps):
-            if pace.left(ITERATIONS) <= step_s / 2:
+            if number and pace.left(ITERATIONS) <= step_s / 2:
                 break
             before = pace.stopwatch.total
             relighting(solver, state)
@@ -341,12 +349,13 @@ class _Fit:
         vertices learn from others.
         """
         grid, points_mm = self._grid, self.twin.surface.vertices_mm
-        least_s, left_s = cost.least_s(self._weights), self.pace.left(ITERATIONS)
-        if grid.finest_mm > grid.coarsest_mm or not self.pace.plan.steps or left_s <= cost.step_s / 2:
+        if grid.finest_mm > grid.coarsest_mm or not self.pace.plan.steps or self.pace.out_of_time():
             return None
+        least_s, left_s = cost.least_s(self._weights), self.pace.left(ITERATIONS)
         if self.pace.hurried:
             sums_s = SUMS * (left_s - least_s if left_s > 2 * least_s else left_s)
-            count = int(cost.pixels * sums_s / cost.sums_s)
+            fewest = LEAST_A_VERTEX * np.count_nonzero(self.twin.surface.seen_by)
+            count = max(fewest, int(cost.pixels * sums_s / cost.sums_s))
             samples = samples.thinned(count, np.random.default_rng(len(samples)))
         if left_s > 2 * least_s:
             return HashOperator.of(points_mm, grid), samples

@@ -161,10 +161,11 @@ def specular_of_even_light(cos_o: Tensor, roughness: Tensor, f0: float) -> Tenso
 @cache
 def _even_light() -> Tensor:
     """A and B, float64 [1, 2, NODES, NODES] over roughness and n·wo, each even in 0 … 1: the mean over facets
-    of density D(m)·(n·m) of what they mirror (Walter et al. 2007, eqs. 35, 36 and 41)."""
+    of density D(m)·(n·m), on one side of the view, of what they mirror (Walter et al. 2007, eqs. 35, 36 and
+    41)."""
     nodes = torch.linspace(0, 1, NODES, dtype=torch.float64)
-    middle = (torch.arange(NODES, dtype=torch.float64) + 0.5) / NODES
-    roughness, cos_o, u, turn = torch.meshgrid(nodes, nodes, middle, 2 * math.pi * middle, indexing="ij")
+    middle, half = ((torch.arange(count, dtype=torch.float64) + 0.5) / count for count in (NODES, NODES // 2))
+    roughness, cos_o, u, turn = torch.meshgrid(nodes, nodes, middle, math.pi * half, indexing="ij")
     alpha = roughness.clamp_min(ROUGHNESS_MIN) ** 2
     cos_m = torch.sqrt((1 - u) / (1 + (alpha * alpha - 1) * u))
     aside = torch.sqrt((1 - cos_o * cos_o) * (1 - cos_m * cos_m))

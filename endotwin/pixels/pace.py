@@ -93,7 +93,8 @@ class Pace:
 
     def leave(self, detail_s: float) -> None:
         """From here on light's steps have their share of the budget, or what is left beside ``detail_s``,
-        seconds of all steps of the detail, and LEAST_LIGHT of what is left in any case."""
+        seconds of all steps of the detail (infinite before those are known), and LEAST_LIGHT of what is left
+        in any case."""
         now_s, end_s = self.stopwatch.total, ITERATIONS * self.budget_s
         least_s = now_s + LEAST_LIGHT * self.left(ITERATIONS)
         self._light_end_s = max(self._light * self.budget_s, end_s - detail_s, least_s)
