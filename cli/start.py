@@ -30,7 +30,6 @@ def main() -> None:
     except SystemExit as ended:
         code = ended.code or 0
     finally:
-        signal.signal(signal.SIGINT, signal.SIG_IGN)  # nothing is left to stop
         end_if_told()
     end(code)
     sys.exit(code)

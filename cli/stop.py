@@ -19,10 +19,12 @@ PATIENCE_S = 1.2
 TIDY_S = 8.0
 """Time that it then has to tidy up after itself; what it leaves then, the next one sweeps."""
 
-UNINTERRUPTED = ("<frozen importlib._bootstrap>", "_workplace")
-"""A file and a function (of ``run.output``) within which a signal waits."""
+UNINTERRUPTED = ("<frozen importlib._bootstrap>", "_workplace", "end_if_told")
+"""A file and functions, one of them of ``run.output``, within which a signal waits."""
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
+AGAIN = (signal.SIGALRM,) if hasattr(signal, "setitimer") else ()
+"""Those that are heeded, and by which one that was put off is tried again."""
 
 _heeded = Event()
 _told: list[int] = []
@@ -50,10 +52,10 @@ def tell(stopped: Stopped) -> int:
 
 
 def end_if_told() -> None:
-    """End the process where it was stopped, be it in the moment in which it ended by itself.
-
-    Python drops its handlers before the second try of a signal that was put off.
-    """
+    """End the process where it was stopped, be it in the moment in which it ended by itself; from here on
+    there is nothing left to stop, and a signal that was put off is not tried a second time."""
+    for number in (*SIGNALS, *AGAIN):
+        signal.signal(number, signal.SIG_IGN)
     if _put_off and not _told:
         print("stopped", file=sys.stderr)
         _told.append(128 + _put_off[0])
@@ -97,8 +99,8 @@ def _stop(number: int, frame: FrameType | None) -> None:
         _heeded.set()
         raise Stopped(number)
     _put_off.append(number)
-    if hasattr(signal, "setitimer"):
-        signal.signal(signal.SIGALRM, lambda _, later: _stop(number, later))
+    if AGAIN:
+        signal.signal(*AGAIN, lambda _, later: _stop(number, later))
         signal.setitimer(signal.ITIMER_REAL, RETRY_S)
     else:  # Windows
         again = Timer(RETRY_S, _thread.interrupt_main, (number,))

@@ -33,14 +33,15 @@ def in_one_process(patch: pytest.MonkeyPatch) -> None:
 
 CHILD = """
 import sys
-from endotwin.cli.start import main
+from endotwin.cli import start
 
+start.end = lambda code: None
 codes = []
 for command in sys.argv[1:]:
     sys.argv = ["endotwin", *command.split("\x1f")]
     code = 0
     try:
-        main()
+        start.main()
     except SystemExit as done:
         code = done.code or 0
     codes.append(code)
