@@ -122,7 +122,7 @@ class GaussNewton:
         self.spread = np.zeros(0)
         self.solve_s = 0.0
         self._border: Tensor | None = None
-        self.out_of_time = out_of_time
+        self._out_of_time = out_of_time
         chosen = drawn(len(samples), SEARCH_SAMPLES, np.random.default_rng(seed))
         self.trial_rows = torch.from_numpy(chosen) if len(chosen) < len(samples) else slice(None)
         self.relight(samples)
@@ -341,11 +341,11 @@ class GaussNewton:
         block = equations.lumped() * (link * link.transpose(1, 2)) * scale
         block = (self.squared_adjoint @ block.reshape(len(link), -1)).reshape(-1, CHANNELS, CHANNELS)
         inverse = torch.linalg.inv(block + torch.diag_embed(self.precision))
-        solved, image = conjugate_gradients(product, right[..., :1], inverse, self.out_of_time)
+        solved, image = conjugate_gradients(product, right[..., :1], inverse, self._out_of_time)
         if not joint:
             return solved[..., 0], torch.zeros_like(state.shared.vector)
         known = self._border if self._border is not None and self._border.shape[2] == free.shape[1] else None
-        bordering = product, right[..., 1:], inverse, self.out_of_time, known, BORDER_TOLERANCE
+        bordering = product, right[..., 1:], inverse, self._out_of_time, known, BORDER_TOLERANCE
         self._border, border_image = conjugate_gradients(*bordering)
         solved, image = torch.cat([solved, self._border], dim=2), torch.cat([image, border_image], dim=2)
         mean, precision = self._prior(state, scale)

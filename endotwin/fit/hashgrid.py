@@ -130,9 +130,9 @@ class HashOperator:
 
         columns, weights, slots = zip(*on_all_cores(one, grid.cells_mm), strict=True)
         first = np.cumsum([0, *map(len, slots)], dtype=np.int32)
-        columns = np.concatenate([each + start for each, start in zip(columns, first, strict=False)], axis=1)
-        weights, starts = np.concatenate(weights, axis=1), np.arange(0, columns.size + 1, columns.shape[1])
-        shape = len(points_mm), first[-1]
+        placed = [each + start for each, start in zip(columns, first[:-1], strict=True)]
+        columns, weights = np.concatenate(placed, axis=1), np.concatenate(weights, axis=1)
+        starts, shape = np.arange(0, columns.size + 1, columns.shape[1]), (len(points_mm), first[-1])
         return cls(
             to_torch(scipy.sparse.csr_matrix((weights.ravel(), columns.ravel(), starts), shape)),
             np.repeat(np.arange(len(slots)), np.diff(first)),

@@ -90,13 +90,16 @@ class Cost:
 
     def least_s(self, weights: int) -> float:
         """Seconds of setting up, and of a step without pixels, with so many ``weights``."""
-        return (self.setup_s + UNCACHED * self.solve_s) * weights / self.weights
+        return self.setup_s * weights / self.weights + self._solving_s(weights)
 
     def detail_s(self, weights: int, pixels: int, steps: int) -> float:
         """Seconds of so many ``steps`` with more weights and pixels; rather too many, since some of what a
         step does with pixels takes no longer with more."""
-        solve_s = (steps - 1) * UNCACHED * self.solve_s * weights / self.weights
-        return self.least_s(weights) + solve_s + steps * self.sums_s * pixels / self.pixels
+        again_s = (steps - 1) * self._solving_s(weights)
+        return self.least_s(weights) + again_s + steps * self.sums_s * pixels / self.pixels
+
+    def _solving_s(self, weights: int) -> float:
+        return UNCACHED * self.solve_s * weights / self.weights
 
 
 Toned = tuple[Tone, Decision]

@@ -65,7 +65,7 @@ class Tilter:
 
         inverse = torch.linalg.inv(lumped(matrix, 3) + precision * torch.eye(3))
         right = torch.from_numpy(pattern.vector(right).astype(np.float32) * np.float32(scale))
-        tilt, _ = conjugate_gradients(product, right[..., None], inverse, self.solver.out_of_time)
+        tilt, _ = conjugate_gradients(product, right[..., None], inverse)
         tilted = normals.copy()
         tilted[pattern.vertices] = unit(normals[pattern.vertices] + tilt[..., 0].numpy())
         return tilted
