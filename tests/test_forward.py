@@ -78,7 +78,7 @@ def test_the_derivatives_of_least_squares_are_those_of_automatic_differentiation
             torch.exp(vector[4]), coat=None if coat is None else (weight, coat.roughness, coat.tail)
         )
         color = shown ** (1 / vector[3])
-        lit = samples.lit(n, q, scale, vector[3])
+        lit = samples.lit(n, q, scale, vector[3], lobes.f0)
         if shared.vignettes:
             exposed = 0.0 if lit.log_exposure is None else lit.log_exposure
             lit = replace(lit, log_exposure=exposed + vector[5] / vector[3] * samples.radius2)
@@ -98,6 +98,19 @@ def test_the_derivatives_of_least_squares_are_those_of_automatic_differentiation
     torch.testing.assert_close(model.by_roughness, by_roughness.diagonal(dim1=0, dim2=2).T, **close)
     if coat is not None:
         torch.testing.assert_close(model.by_coat, by_weight, **close)
+
+
+@pytest.mark.parametrize("coat", [None, (0.6, 0.2, 2.0), (3.0, 0.3, 1.0)])
+def test_gloss_is_linear_in_f0(coat):
+    generator = torch.Generator().manual_seed(3)
+    cos, roughness = torch.rand(2, 50, generator=generator, dtype=torch.float64)
+    dull, bright = Lobes(0.01, coat=coat), Lobes(0.08, coat=coat)
+    more = bright.gloss(cos, roughness) - dull.gloss(cos, roughness)
+    torch.testing.assert_close(more[:, 0], 0.07 * dull.gloss_by_f0(cos, roughness))
+    assert not more[:, 1].any()
+    more = bright.glossy_albedo(roughness) - dull.glossy_albedo(roughness)
+    torch.testing.assert_close(more, bright.f0_albedo(roughness) - dull.f0_albedo(roughness))
+    torch.testing.assert_close(dull.f0_albedo(roughness), more / 7)
 
 
 @pytest.mark.parametrize("weight", [0.4, 1.0, 3.0, 50.0])

@@ -16,7 +16,7 @@ from endotwin.effects.specular import Specular
 from endotwin.fit.gauss_newton import GaussNewton
 from endotwin.fit.light_stage import MOVES
 from endotwin.fit.lighting import Bouncer, Relighting, lit
-from endotwin.fit.model import Globals, at_pixels
+from endotwin.fit.model import GLOBALS, Globals, at_pixels, glow
 from endotwin.fit.within import Within
 from endotwin.light.bounced import Bounce
 from endotwin.surface.casting import Caster
@@ -131,6 +131,27 @@ def test_a_photo_that_is_lit_while_another_is_gets_the_light_that_it_gets_alone(
     bouncer.meanwhile = lambda: bounced(other)
     torch.testing.assert_close(bounced(one), alone)
     assert bouncer.meanwhile is None
+
+
+@pytest.mark.parametrize("name", ["ln f0", "ln albedo scale"])
+def test_how_glow_grows_with_the_white_lobe_is_known_before_light_is_cast_again(exposed_unevenly, name):
+    twin, samples, state = exposed_unevenly
+    shared = Globals.of(twin.light, twin.response, 0.04, bounce=True)
+    more = 0.2 * torch.tensor([each == name for each in (*GLOBALS, "ln albedo scale")])
+    brighter = replace(shared, vector=shared.vector + more)
+    effects = Effects([Specular(), Interreflection(2.0)])
+    relighting = Relighting(twin.surface, Caster(twin.surface), effects, samples.views)
+    triangles = torch.from_numpy(twin.surface.triangles.astype(np.int64))
+    material = at_pixels(samples, triangles, state.materials)
+    here, there = (
+        relighting.bounced(samples, triangles, replace(state, shared=each)) for each in (shared, brighter)
+    )
+    before, told, true = (
+        glow(lit, material, each) for lit, each in ((here, shared), (here, brighter), (there, brighter))
+    )
+    assert (true > before).all()
+    grown = (told - before).sum(dim=0) / (true - before).sum(dim=0)
+    torch.testing.assert_close(grown, torch.ones(3), rtol=0.15, atol=0)
 
 
 @pytest.mark.parametrize("alike", [True, False])

@@ -137,6 +137,8 @@ def in_a_tube(samples: Samples) -> Samples:
         by_scale=uniform(1, 2, 3),
         by_gamma=uniform(1, 4, 3),
         gloss=torch.stack([uniform(0, 0.1), uniform(0.8, 1)], dim=1),
+        by_f0=uniform(0.05, 0.2, 3),
+        gloss_by_f0=uniform(0.5, 1),
     )
     return replace(samples, bounce=bounce)
 

@@ -65,9 +65,9 @@ MOST_BRIGHTER = 1.5
 MOST_GAIN_STEP = 1.0
 """Of the logarithm of a gain: a photo all black or white tells none, and its slope is next to nothing."""
 
-BORDER_TOLERANCE = 1e-2
-"""To which the materials that follow each shared parameter are found: an error of theirs counts squared, and
-they change little from step to step."""
+BORDER_TOLERANCE = 1e-3
+"""To which the materials that follow each shared parameter are found: what they lack, the parameter makes up
+for, and the pixels tell little of γ and f0 beside them. They change little from step to step."""
 
 _NO_GAINS = np.zeros(0)
 LENGTHS = (1.0, 0.5, 0.25, 0.1, 0.03)

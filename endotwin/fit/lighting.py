@@ -273,6 +273,10 @@ class Bouncer:
             by, seen_by = MOVING, (shared.gamma, albedo(steeper))
         bounce = self._light.expanded(places, n, q, albedo(base_color), gloss, scale, seen_by, by)
         shown = shared.gamma * torch.log(at_pixels(samples, triangles, base_color))
+        if shared.f0 > 0:
+            share = lobes.f0_albedo(materials[:, 3].mean()) / (math.exp(scale) * base_color.mean(dim=0))
+            by_f0 = lobes.gloss_by_f0(samples.cos, roughness)
+            bounce = bounce.beside_lobe(shared.f0, scale, share, by_f0)
         return replace(samples, bounce=replace(bounce, shown=shown))
 
     def _places(self, samples: Samples) -> Places:

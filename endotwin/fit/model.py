@@ -130,9 +130,9 @@ class Globals:
         return float(self.vector[-1]) if self.bounces else 0.0
 
     @property
-    def bouncing(self) -> tuple[float, float, float, float]:
-        """What says how light bounces: n, q, ln of the albedo's scale, γ."""
-        return (*self.log_light[1:], self.log_scale, self.gamma)
+    def bouncing(self) -> tuple[float, float, float, float, float]:
+        """What says how light bounces: n, q, ln of the albedo's scale, γ, f0."""
+        return (*self.log_light[1:], self.log_scale, self.gamma, self.f0)
 
 
 def columns_of(shared: Globals, bordered: bool) -> np.ndarray:
@@ -311,10 +311,15 @@ def linearise(samples: Samples, material: Tensor, shared: Globals) -> Linearised
         by_gamma = by_gamma + slope * glow * samples.bounce.by_gamma
         if samples.bounce.shown is not None:
             by_color = by_color + slope * glow * samples.bounce.following / base_color
-    by_globals = [by_light * x, by_light * axis, -by_light * distance, by_gamma, slope * shine[:, None]]
-    by_globals += by_k2
+    by_f0, by_scale = shine[:, None], []
     if samples.bounce is not None:
-        by_globals.append(slope * glow * samples.bounce.by_scale)
+        by_scale = [slope * glow * samples.bounce.by_scale]
+        if samples.bounce.by_f0 is not None:
+            whiter = glow * samples.bounce.by_f0
+            by_f0 = by_f0 + whiter + shared.f0 * samples.bounce.gloss_by_f0[:, None] * mirrored
+            by_scale[0] = by_scale[0] + slope * whiter
+    by_globals = [by_light * x, by_light * axis, -by_light * distance, by_gamma, slope * by_f0]
+    by_globals += by_k2 + by_scale
     return Linearised(
         predicted=power - floor,
         by_color=by_color,

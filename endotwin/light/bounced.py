@@ -6,6 +6,7 @@ n and q and of how bright the tissue is.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -96,12 +97,15 @@ class Places:
 
 @dataclass(frozen=True)
 class Bounce(Rows):
-    """Indirect irradiance at N points, E = L0·exp(log + n·by_n + q·by_q + ln κ·by_scale + γ·by_gamma), κ a
-    factor on all albedo, γ the response through which photos show it.
+    """Indirect irradiance at N points, E = L0·exp(log + n·by_n + q·by_q + ln κ·by_scale + γ·by_gamma +
+    ln κf0·by_f0), κ a factor on all albedo, γ the response through which photos show it, κf0 the reflectance
+    of the tissue's white lobe.
 
     Attributes:
         log, by_scale, by_gamma: float32 [N, 3]. by_n, by_q: float32 [N], the channels' mean.
-        gloss: float32 [N, 2], ``Lobes.gloss`` of the points; None: nobody asked for it.
+        gloss: float32 [N, 2], ``Lobes.gloss`` of the points, of the first what does not grow with f0, over κ;
+            None: nobody asked for it.
+        by_f0: float32 [N, 3], gloss_by_f0: float32 [N], how both grow with f0; None: they stay as they are.
         surroundings: float32 [N, 3], radiosity of that over E; None: 1.
         shown: float32 [N, 3], γ·ln of the points' base colours that throw it; None: it follows no colours.
         tissue: float32 [N, 3], γ times the mean of ln of all tissue's, alike in all rows.
@@ -113,6 +117,8 @@ class Bounce(Rows):
     by_scale: Tensor
     by_gamma: Tensor
     gloss: Tensor | None = None
+    by_f0: Tensor | None = None
+    gloss_by_f0: Tensor | None = None
     surroundings: Tensor | None = None
     shown: Tensor | None = None
     tissue: Tensor | None = None
@@ -121,13 +127,29 @@ class Bounce(Rows):
         """The same on ``device``."""
         return Bounce(**{name: None if x is None else x.to(device) for name, x in vars(self).items()})
 
-    def irradiance(self, n: float, q: float, log_scale: float = 0.0, gamma: float = 0.0) -> Tensor:
+    def irradiance(
+        self, n: float, q: float, log_scale: float = 0.0, gamma: float = 0.0, f0: float = 0.0
+    ) -> Tensor:
         """E with L0 = 1, [N, 3]."""
-        return torch.exp(self.log_irradiance(n, q, log_scale, gamma))
-
-    def log_irradiance(self, n: float, q: float, log_scale: float = 0.0, gamma: float = 0.0) -> Tensor:
         by_light = (n * self.by_n + q * self.by_q)[:, None]
-        return self.log + by_light + log_scale * self.by_scale + gamma * self.by_gamma
+        log = self.log + by_light + log_scale * self.by_scale + gamma * self.by_gamma
+        if self.by_f0 is not None and f0 > 0:
+            log = log + (log_scale + torch.log(torch.as_tensor(f0, dtype=torch.float64))) * self.by_f0
+        return torch.exp(log)
+
+    def glossy(self, f0: float) -> Tensor:
+        """``Lobes.gloss`` of the points, the first over κ, [N, 2]."""
+        if self.gloss_by_f0 is None:
+            return self.gloss
+        return torch.stack([self.gloss[:, 0] + f0 * self.gloss_by_f0, self.gloss[:, 1]], dim=1)
+
+    def beside_lobe(self, f0: float, log_scale: float, share: Tensor, gloss_by_f0: Tensor) -> Bounce:
+        """The same, exact at this ``f0`` and scale, where all f0 grow: of what albedos do to it if all grow,
+        the ``share`` [3], and ``gloss_by_f0`` [N] to what the points mirror."""
+        by_f0 = share * self.by_scale
+        log = self.log - (log_scale + math.log(f0)) * by_f0
+        gloss = torch.stack([self.gloss[:, 0] - f0 * gloss_by_f0, self.gloss[:, 1]], dim=1)
+        return replace(self, log=log, gloss=gloss, by_f0=by_f0, gloss_by_f0=gloss_by_f0)
 
     def mirrored(self, irradiance: Tensor) -> Tensor:
         """Radiosity [N, 3] of what the points mirror to their cameras, where this is their E [N, 3]."""
@@ -239,7 +261,7 @@ class BouncedLight:
                 slope = slope.mean(dim=1, keepdim=True)
             level = level - about[name] * slope
             slopes[name] = slope.reshape(slopes[name].shape)
-        return Bounce(level, *slopes.values(), gloss, surroundings)
+        return Bounce(level, *slopes.values(), gloss, surroundings=surroundings)
 
     def _expected(
         self, places: Places, n: float, q: float, log_scale: float, albedo: Albedo, mirrored: bool

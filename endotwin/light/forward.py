@@ -11,6 +11,7 @@ exponential in n and q: the derivatives by those follow from the same pieces.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -92,11 +93,25 @@ class Lobes:
         through = 1 - coat
         return torch.stack([coat + through * tissue, through], dim=-1)
 
+    def gloss_by_f0(self, cos_o: Tensor, roughness: Tensor) -> Tensor:
+        """By how much the first of ``gloss`` grows with f0, of which it is linear, [N]."""
+        grazing, whole = (shading.specular_of_even_light(cos_o, roughness, f0) for f0 in (0.0, 1.0))
+        return self.gloss(cos_o, roughness)[..., 1] * (whole - grazing)
+
     def glossy_albedo(self, roughness: Tensor) -> Tensor:
-        """Share of light from all around that white lobes send back in all, [N]: 2·∫gloss(cos)·cos d cos."""
-        nodes, weights = np.polynomial.legendre.leggauss(8)
-        cos, weights = (torch.from_numpy(x).to(roughness.dtype) for x in ((nodes + 1) / 2, weights))
-        return (self.gloss(cos, roughness[..., None])[..., 0] * cos * weights).sum(dim=-1)
+        """Share of light from all around that white lobes send back in all, [N]."""
+        return _in_all(lambda cos, rough: self.gloss(cos, rough)[..., 0], roughness)
+
+    def f0_albedo(self, roughness: Tensor) -> Tensor:
+        """What of ``glossy_albedo`` is in proportion to f0, [N]."""
+        return self.f0 * _in_all(self.gloss_by_f0, roughness)
+
+
+def _in_all(gloss: Callable[[Tensor, Tensor], Tensor], roughness: Tensor) -> Tensor:
+    """2·∫gloss(cos)·cos d cos for places of ``roughness`` [N], [N]."""
+    nodes, weights = np.polynomial.legendre.leggauss(8)
+    cos, weights = (torch.from_numpy(x).to(roughness.dtype) for x in ((nodes + 1) / 2, weights))
+    return (gloss(cos, roughness[..., None]) * cos * weights).sum(dim=-1)
 
 
 @dataclass(frozen=True)

@@ -147,13 +147,13 @@ class Samples:
         share = self.barycentric.numpy()
         return unit(np.einsum("nk,nka,nab->nb", share, corners, self.rotation, optimize=True))
 
-    def lit(self, n: float, q: float, log_scale: float = 0.0, gamma: float = 0.0) -> Lit:
-        """What lights the pixels, where the light's n and q, the albedo's scale and γ say what is bounced."""
+    def lit(self, n: float, q: float, log_scale: float = 0.0, gamma: float = 0.0, f0: float = 0.0) -> Lit:
+        """What lights the pixels; n, q, the scale of albedos, γ and f0 say how light bounces."""
         more = {"log_exposure": self.log_exposure}
         if self.bounce is not None:
-            irradiance = self.bounce.irradiance(n, q, log_scale, gamma)
+            irradiance = self.bounce.irradiance(n, q, log_scale, gamma, f0)
             mirrored = self.bounce.mirrored(irradiance)
-            more |= {"irradiance": irradiance, "mirrored": mirrored, "gloss": self.bounce.gloss}
+            more |= {"irradiance": irradiance, "mirrored": mirrored, "gloss": self.bounce.glossy(f0)}
         if self.guides is not None:
             return Lit(self.cos, self.guides, **more)
         return Lit.at_lens(self.cos, self.sin2, self.log_cos_axis, self.log_distance, **more)
