@@ -22,7 +22,6 @@ from endotwin.evidence.tone import judged as judged_tone
 from endotwin.fit import vignetting
 from endotwin.fit.lighting import Relighting
 from endotwin.fit.model import Globals, at_pixels
-from endotwin.fit.scout import likeliest_n
 from endotwin.fit.state import State, as_bright, too_dark
 from endotwin.fit.steps import WORSE, solver_of, started, stepped
 from endotwin.fit.within import Renewed, Within
@@ -39,8 +38,7 @@ STEPS, BOUNCE_STEPS = 6, 12
 """Steps at most, and those where light bounces, beside those of a new coat's trial."""
 
 HOLD_STEPS = 3
-"""In which n and γ stay, and how strongly light bounces is found: steps that find both at once may end beside
-another n and half of the bounce."""
+"""In which n and γ stay, and how strongly light bounces is found; found with them, f0 sets out too high."""
 
 COAT_STEP, NEAR, LATEST = 2, 0.1, 8
 """A coat that nobody asked for, and a tone curve, are judged when light and materials are near: after so many
@@ -162,9 +160,6 @@ class LightStage:
         self._unit_mm = unit_mm(surface)
         self._moves = MOVES if relighting.effects.guides_mm else 0
         self._goes_on = before is not None and before.state.shared.bounces and relighting.bounces
-        if relighting.bounces and not self._goes_on and not pace.hurried:
-            n = likeliest_n(samples, surface, start, relighting, BOUNCE_HELD, tone)
-            start = replace(start, light=replace(start.light, n=n))
         began = pace.stopwatch.total
         options = {"out_of_time": pace.light_is_over, "device": device}
         self._solver, operator = solver_of(samples, surface, self._unit_mm, CELL_MM, **options)
@@ -216,7 +211,7 @@ class LightStage:
     def _in_one_step(self) -> Toned | None:
         """Light and materials in one step, for the strength of the bounce. Ends early where photos show no
         bounce. Coat and tone are judged beside a response that is held near that of displays, for which they
-        could pass; then photos are believed as far as the model explains them."""
+        could pass; then photos are believed as far as the model explains them, by one step at least."""
         number, near, best = 0, self._goes_on and self._pace.hurried, None
         while number < BOUNCE_STEPS and not self._late:
             if near and (toned := self._newly_bent()) is not None:
@@ -227,7 +222,7 @@ class LightStage:
             holding = number < HOLD_STEPS and not self._goes_on
             held = ("n", "gamma", "k2", "contrast") if holding else self._undetermined
             self._solver.held = (*held, *BOUNCE_HELD)
-            on_trial = self._bare is not None
+            on_trial, believed = self._bare is not None, best is not None
             gain = self._step_coated(shared) if shared.coat else self._step(joint=True)
             if self._bare is not None and not on_trial:
                 number = min(number, BOUNCE_STEPS - LATEST)
@@ -246,8 +241,7 @@ class LightStage:
             if tried:
                 self._choose_lobe()
             steady = self._changed_by_less(gain, CONVERGED) or _steady(shared, self._state.shared)
-            done = steady and not holding and not self._moves
-            number = self._next(number, BOUNCE_STEPS, number + 1, done)
+            number = self._next(number, BOUNCE_STEPS, number + 1, steady and believed and not self._moves)
             near = near or number >= LATEST or (self._changed_by_less(gain, NEAR) and not holding)
         self._leave_worse_coat()
         if best is not None:

@@ -193,10 +193,10 @@ class Relighting:
         """``samples`` under all but bounced light and what is faint, as it was found last."""
         return lit(samples, self._surface, self._caster, self.effects)
 
-    def keep_light(self, stays: bool = True) -> None:
-        """From here on light and response stay, or move again."""
+    def keep_light(self) -> None:
+        """From here on light and response stay."""
         if self.bounces:
-            self._bouncer.light_stays = stays
+            self._bouncer.light_stays = True
 
     def without_bounce(self, solver: GaussNewton, state: State) -> State:
         """From here on no light bounces: the photos show none. ``state`` as if there had never been any."""

@@ -43,7 +43,7 @@ from endotwin.light.radiosity import Radiosity
 from endotwin.pixels.length_unit import unit_mm
 from endotwin.pixels.pace import ITERATIONS, Pace
 from endotwin.pixels.samples import Samples, Views, drawn, gather, whole_groups
-from endotwin.pixels.start import ALBEDO_TOP, BRIGHT, PRIOR, Start, closed_form, start_at
+from endotwin.pixels.start import ALBEDO_TOP, BRIGHT, Start, closed_form, start_at
 from endotwin.run.threads import THREADS, one_core
 from endotwin.surface import Surface
 from endotwin.surface.casting import Caster
@@ -285,14 +285,11 @@ class _Fit:
             return _Lighted(decided, samples, start, relighting, stage.cost, stage.found())
 
     def _start_beside(self, decided: Decided, shown: Samples) -> Start:
-        """Where the fit starts beside the effects that are ``decided``, from what is ``shown``. Where light
-        bounces n is yet to be scouted, if there is time."""
+        """Where the fit starts beside the effects that are ``decided``, from what is ``shown``."""
         mesh = self.twin.surface.triangles, len(self.twin.surface.vertices_mm)
         if decided.start is None:
             return closed_form(shown, *mesh)
         n, q, gamma = decided.start
-        if "interreflection" in decided.effects and not self.pace.hurried:
-            n = PRIOR["n"]
         return start_at(shown, *mesh, n, q, gamma)
 
     def _decided(self, pixels: _Pixels, shown: Samples, start: Start, near_mm: Guides) -> Decided:
