@@ -116,7 +116,8 @@ def explained(
     """A tube under a response of ``gamma`` and a ``tone`` curve, behind a ``lens``, and photos of it that
     show just what is predicted."""
     twin = tube_twin.fitted(tube_twin.seen(tube_twin.surface()))
-    samples = tube_twin.photographed(twin, tube_twin.CAMERA, tube_twin.pose(0.5)[None])
+    poses = np.stack([tube_twin.pose(0.4), tube_twin.pose(0.6)])
+    samples = tube_twin.photographed(twin, tube_twin.CAMERA, poses)
     effects = Effects([Specular(), *([Interreflection(4.0)] * bounces), *([lens] if lens else [])])
     shared = Globals.of(twin.light, Response(gamma), twin.materials.f0, bounce=bounces)
     state = replace(tube_twin.state_of(twin), shared=shared.behind(lens).under(tone))

@@ -137,8 +137,6 @@ def in_a_tube(samples: Samples) -> Samples:
         by_scale=uniform(1, 2, 3),
         by_gamma=uniform(1, 4, 3),
         gloss=torch.stack([uniform(0, 0.1), uniform(0.8, 1)], dim=1),
-        by_f0=uniform(0.05, 0.2, 3),
-        gloss_by_f0=uniform(0.5, 1),
     )
     return replace(samples, bounce=bounce)
 
@@ -147,6 +145,14 @@ def following(samples: Samples) -> Samples:
     """The same samples, lit by tissue of ``made_materials`` and brighter as that gets brighter."""
     shown = SHARED.gamma * made_materials(len(samples))[:, :3].log()
     return replace(samples, bounce=replace(samples.bounce, shown=shown))
+
+
+def shining(samples: Samples) -> Samples:
+    """The same samples, lit by tissue that shines the more, as they do, the more f0 is."""
+    generator = torch.Generator().manual_seed(8)
+    by_f0, gloss = torch.rand(2, len(samples), generator=generator, dtype=torch.float64)
+    bounce = samples.bounce.beside_lobe(0.04, 0.1, torch.tensor([0.05, 0.1, 0.2]).double(), gloss)
+    return replace(samples, bounce=replace(bounce, by_f0=by_f0[:, None] * bounce.by_f0))
 
 
 def behind_a_lens(samples: Samples) -> Samples:
@@ -161,6 +167,7 @@ SCENES = {
     "in a tube": in_a_tube,
     "beside the lens in a tube": lambda samples: in_a_tube(beside_the_lens(samples)),
     "in a tube whose light follows its colours": lambda samples: following(in_a_tube(samples)),
+    "in a tube whose light follows its lobe": lambda samples: shining(in_a_tube(samples)),
     "behind a lens": behind_a_lens,
     "beside the lens in a tube behind it": lambda samples: behind_a_lens(in_a_tube(beside_the_lens(samples))),
     "toned": lambda samples: samples,
