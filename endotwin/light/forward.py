@@ -83,20 +83,26 @@ class Lobes:
         A coat of weight below 1 lies on as much of the tissue; a heavier one is denser than water. As any
         layer it mirrors all of what grazes it, which the tissue then does not.
         """
-        tissue = coat = torch.zeros_like(cos_o * roughness)
+        tissue = torch.zeros_like(cos_o * roughness)
         if self.f0 > 0:
             tissue = shading.specular_of_even_light(cos_o, roughness, self.f0)
-        if self.coat is not None:
-            weight, smooth, _ = self.coat
-            f0, covered = shading.F0_WATER * max(1.0, weight), min(1.0, weight)
-            coat = covered * shading.specular_of_even_light(cos_o, torch.full_like(coat, smooth), f0)
+        coat = self._gloss_of_coat(cos_o, roughness)
         through = 1 - coat
         return torch.stack([coat + through * tissue, through], dim=-1)
 
     def gloss_by_f0(self, cos_o: Tensor, roughness: Tensor) -> Tensor:
         """By how much the first of ``gloss`` grows with f0, of which it is linear, [N]."""
         grazing, whole = (shading.specular_of_even_light(cos_o, roughness, f0) for f0 in (0.0, 1.0))
-        return self.gloss(cos_o, roughness)[..., 1] * (whole - grazing)
+        return (1 - self._gloss_of_coat(cos_o, roughness)) * (whole - grazing)
+
+    def _gloss_of_coat(self, cos_o: Tensor, roughness: Tensor) -> Tensor:
+        """What the coat alone sends of light from all around, over places of ``roughness``, [N]."""
+        nothing = torch.zeros_like(cos_o * roughness)
+        if self.coat is None:
+            return nothing
+        weight, smooth, _ = self.coat
+        f0, covered = shading.F0_WATER * max(1.0, weight), min(1.0, weight)
+        return covered * shading.specular_of_even_light(cos_o, torch.full_like(nothing, smooth), f0)
 
     def glossy_albedo(self, roughness: Tensor) -> Tensor:
         """Share of light from all around that white lobes send back in all, [N]."""
