@@ -92,8 +92,27 @@ def test_a_strip_of_a_tube_tells_its_axis_and_radius(folds):
     tube = tube_of(strip(folds=folds))
     assert abs(tube.axis[2]) > 0.999
     assert tube.radius_mm == pytest.approx(RADIUS_MM, rel=0.02 if not folds else 0.1)
-    assert np.linalg.norm(tube.centre_mm[:2]) < 0.02 * RADIUS_MM + folds / 2
+    centre_mm, _ = tube.centre(np.linspace(-15, 15, 7))
+    assert np.linalg.norm(centre_mm[:, :2], axis=1).max() < 0.02 * RADIUS_MM + folds / 2
     assert tube.holds(np.zeros((1, 3))) and not tube.holds(np.array([[-1.2 * RADIUS_MM, 0, 0]]))
+
+
+@pytest.mark.parametrize("bend_mm", [35.0, 80.0])
+def test_a_strip_of_a_bent_tube_tells_how_it_goes_on(bend_mm):
+    """An arc of six radii in length about (0, −bend, 0); a radius beyond each of its ends the tube still lies
+    on it."""
+    straight = strip()
+    around, aside, along = straight.vertices_mm.T
+    angle = 2 * along / bend_mm
+    bent = np.stack(
+        [-aside, (bend_mm + around) * np.cos(angle) - bend_mm, (bend_mm + around) * np.sin(angle)]
+    )
+    tube = tube_of(surface_of(np.zeros(3), bent.T.astype(np.float32), straight.triangles))
+    assert tube.radius_mm == pytest.approx(RADIUS_MM, rel=0.03)
+    angle = np.linspace(-1, 1, 9) * 40 / bend_mm
+    true_mm = np.stack([0 * angle, bend_mm * (np.cos(angle) - 1), bend_mm * np.sin(angle)], axis=1)
+    centre_mm, tangent = tube.centre(tube.along_mm(true_mm))
+    assert np.linalg.norm(np.cross(true_mm - centre_mm, tangent), axis=1).max() < 0.3 * RADIUS_MM
 
 
 @pytest.mark.parametrize("seed", range(4))
