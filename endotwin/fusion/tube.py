@@ -92,10 +92,7 @@ def tube_of(surface: Surface) -> Tube | None:
     vertices_mm, normals = (
         each[chosen].astype(np.float64) for each in (surface.vertices_mm, surface.normals)
     )
-    weight = np.ones(len(normals))
-    for _ in range(ROUNDS):
-        axis = np.linalg.eigh((normals * weight[:, None]).T @ normals)[1][:, 0]
-        weight = _trust(normals @ axis)
+    axis = _axis(normals)
     across, start_mm = frame_along(axis)[:2].T, np.mean(vertices_mm @ axis)
     flat_mm, towards = vertices_mm @ across, normals @ across
     length_mm = float(np.ptp(vertices_mm @ axis))
@@ -120,6 +117,15 @@ def tube_of(surface: Surface) -> Tube | None:
     line_mm = (across @ found_mm[:-1].reshape(2, -1)).T / length_mm ** POWERS[:, None]
     line_mm[:2] += [[start_mm], [1.0]] * axis
     return Tube(axis, line_mm, radius_mm)
+
+
+def _axis(normals: np.ndarray) -> np.ndarray:
+    """The unit direction [3] that most ``normals`` [N, 3] are across of."""
+    trust = np.ones(len(normals))
+    for _ in range(ROUNDS):
+        axis = np.linalg.eigh((normals * trust[:, None]).T @ normals)[1][:, 0]
+        trust = _trust(normals @ axis)
+    return axis
 
 
 def _powers(along: np.ndarray) -> np.ndarray:
